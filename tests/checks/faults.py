@@ -47,7 +47,7 @@ PLAIN = ("--allow-unsigned", "--stage", "full", "--i-know", "--robot-name", "cel
 LOST = 1.0
 """Maximum loss of a recording before a fault [s]."""
 WATCHED = 1.0
-"""Time for which the robot is observed after the end of the deployment [s]."""
+"""Time that passes for the robot while it is observed after the end of the deployment [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +112,12 @@ class Scene:
     """Messages of other programs."""
 
     def deploy(
-        self, name: str, *before: str, program: tuple[str, ...] = ("-m", "bam_train.cli.deploy"), disk: str = ""
+        self,
+        name: str,
+        *before: str,
+        program: tuple[str, ...] = ("-m", "bam_train.cli.deploy"),
+        disk: str = "",
+        episodes: int = 4,
     ) -> Deployment:
         """Start a bam-deploy, and return it.
 
@@ -121,9 +126,10 @@ class Scene:
             before: Words before its command.
             program: Arguments of Python.
             disk: The subfolder for its recording.
+            episodes: Number of its episodes.
         """
         recording = f"{name}.mcap"
-        flags = ["--robot", self.network.url, "--yes", "--episodes", "4", *self.flags]
+        flags = ["--robot", self.network.url, "--yes", "--episodes", str(episodes), *self.flags]
         flags += ["--trials", str(self.folder / "trials.jsonl")] if self.flags else []
         flags += ["--record", str(self.folder / disk / recording)]
         command = [*before, sys.executable, *program, str(self.checkpoint.resolve()), *flags]
@@ -170,7 +176,10 @@ def hog_cores(scene: Scene) -> None:
 
 def deploy_twice(scene: Scene) -> None:
     second = scene.deploy("second")
-    scene.others.append(f"the second deployment, status {second.finish()}: {second.messages()[-1]}")
+    status = second.finish()
+    if scene.deployment.process.poll() is not None:
+        raise RuntimeError("the first deployment ended before the second one")
+    scene.others.append(f"the second deployment, status {status}: {' '.join(second.messages()[-1:])}")
 
 
 def interrupt(times: int) -> Callable[[Scene], None]:
@@ -232,7 +241,7 @@ FAULTS = (
     Fault("this computer's clock jumps by an hour", jump_clock, (0,), with_clock),
     Fault("all cores hogged for 5 s", hog_cores, (0, 3, 4)),
     Fault("disk full", lambda scene: None, (0,), with_full_disk, is_recorded=False),
-    Fault("two deployments to one robot", deploy_twice, (0,)),
+    Fault("two deployments to one robot", deploy_twice, (0,), lambda scene: scene.deploy("first", episodes=15)),
     Fault("Ctrl-C", interrupt(1), (130,)),
     Fault("Ctrl-C twice", interrupt(2), (130,)),
 )
@@ -287,8 +296,12 @@ def strike(fault: Fault, cell: RobotCell, checkpoint: Path, flags: tuple[str, ..
         start = await_policy(scene, fault)
         fault.inject(scene)
         status = deployment.finish()
-        time.sleep(WATCHED)
-        log, recorded = cell.log().since(start), read_recording(deployment.recording)
+        end = time.monotonic() + LONGEST
+        while (log := cell.log().since(start)).passed(deployment.ended) < WATCHED:
+            if time.monotonic() > end:
+                raise RuntimeError("the robot's process stands still")
+            time.sleep(0.1)
+        recorded = read_recording(deployment.recording)
     saw = (*deployment.messages(start), *scene.others)
     problems = [*([] if status in fault.statuses else [f"exit status {status}"])]
     problems += problems_of(log, start, deployment.ended, scene.link_back, cell.command_timeout)
@@ -325,12 +338,13 @@ def last_moving(log: CellLog, start: float) -> float:
 
 
 def problems_of(log: CellLog, start: float, ended: float, link_back: float | None, watchdog: float) -> Iterator[str]:
-    """Describe each wrong motion or command since `start` [s]."""
-    commanded, moving = max([start, *log.arrivals()]), last_moving(log, start)
-    if moving > commanded + watchdog + BRAKING:
-        yield f"it moved {moving - commanded:.2f} s after the last command"
+    """Describe each wrong motion or command since `start` [s]; the robot's own time counts for its motions."""
+    commanded = max([start, *log.arrivals()])
+    moved = log.passed(commanded, last_moving(log, start))
+    if moved > watchdog + BRAKING:
+        yield f"it moved {moved:.2f} s after the last command"
     if log.speeds[-1] > AT_REST:
-        yield f"it still moves {log.times[-1] - commanded:.2f} s after the last command"
+        yield f"it still moves {log.passed(commanded):.2f} s after the last command"
     if last_motion(log, start) > ended:
         yield "a command came after the end"
     late = 0 if link_back is None else int((log.motions() > link_back).sum())

@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import ctypes
 import logging
+import math
 import multiprocessing
 import os
 import pickle
@@ -80,6 +81,12 @@ class CellLog:
     """The greatest measured speed of a joint, or of the base [rad/s or m/s]. Shape: (n,)."""
     is_base: bool
     """Whether commands are speeds."""
+    tick_period: float
+    """Time that passes for the robot with a tick [s]: it stands still while its process waits for a core."""
+
+    def passed(self, start: float, end: float = math.inf) -> float:
+        """Time that passed for the robot between two times of the clock [s]."""
+        return self.tick_period * int(((self.times > start) & (self.times <= end)).sum())
 
     def arrivals(self) -> Array:
         """Times of all commands [s]."""
@@ -98,7 +105,7 @@ class CellLog:
         first = max(0, int(np.searchsorted(self.times, start)) - 1)
         fields = self.times, self.commands, self.resting, self.targets, self.speeds
         times, commands, resting, targets, speeds = (values[first:] for values in fields)
-        return CellLog(times, commands, resting, targets, speeds, self.is_base)
+        return CellLog(times, commands, resting, targets, speeds, self.is_base, self.tick_period)
 
 
 class RobotCell:
@@ -165,7 +172,8 @@ class RobotCell:
         data = np.fromfile(self._path)
         rows = data[: len(data) // (size + 4) * (size + 4)].reshape(-1, size + 4)
         is_base = "m/s" in self.spec.command.units
-        return CellLog(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 4:], rows[:, 3], is_base)
+        columns = rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 4:], rows[:, 3]
+        return CellLog(*columns, is_base, self.spec.period / PARTS)
 
     def _start(self, name: str, main: Callable[..., None], *arguments: Any) -> Any:
         ready = _PROCESSES.Event()

@@ -3,11 +3,12 @@
 import contextlib
 import sys
 
+import numpy as np
 import pytest
 
 from tests.benchmarks import harness
 from tests.checks import faults
-from tests.checks.robot_cell import RobotCell, StateFault
+from tests.checks.robot_cell import CellLog, RobotCell, StateFault
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +45,7 @@ def test_a_typo_is_refused(monkeypatch, capsys, flags, text):
         ("bridge killed", 4, ("bam-deploy: link lost: ws://127.0.0.1:",)),
     ],
 )
-def test_the_robot_rests_and_the_operator_knows_why(cell, monkeypatch, name, status, said):
-    monkeypatch.setattr(faults, "BRAKING", 5.0)  # on a busy computer
+def test_the_robot_rests_and_the_operator_knows_why(cell, name, status, said):
     fault = next(fault for fault in faults.FAULTS if fault.name == name)
     outcome = None
     for _ in range(3):
@@ -55,3 +55,19 @@ def test_the_robot_rests_and_the_operator_knows_why(cell, monkeypatch, name, sta
     assert (outcome.problems, outcome.status) == ((), status)
     seen = [line for line in outcome.saw if "warning" not in line]  # of missed ticks, on a busy computer
     assert all(line.startswith(text) for line, text in zip(seen[-1:], said, strict=True)), seen
+
+
+@pytest.mark.parametrize(
+    ("moving", "problems"),
+    [
+        (8, ()),
+        (30, ("it moved 0.30 s after the last command",)),
+        (50, ("it moved 0.50 s after the last command", "it still moves 0.50 s after the last command")),
+    ],
+)
+def test_the_time_of_a_robot_that_a_busy_computer_holds_up_stands_still(moving, problems):
+    ticks = np.arange(101)
+    times = 0.01 * ticks + (ticks > 55) * 2.0  # its process stands still for two seconds
+    speeds = 0.5 * (ticks <= 50 + moving)
+    log = CellLog(times, np.minimum(ticks, 50), ticks > 50, np.zeros((101, 6)), speeds, False, 0.01)
+    assert tuple(faults.problems_of(log, 0.0, 0.5, None, watchdog=-0.1)) == problems
