@@ -209,34 +209,72 @@ def steps_below_the_gate(robot, state):
     return run
 
 
-def measure_link(flags):
-    """RosbridgeRobot's command to state against bare roslibpy's topic there and back, in turns."""
+def bare_topics(port, sent, heard):
+    """Two functions of roslibpy and nothing else: publish each message and wait for all that answers; close.
+
+    Args:
+        port: Port of a server on 127.0.0.1.
+        sent: Topic -> type and message.
+        heard: Topics of the answers -> type.
+    """
     import roslibpy
 
-    with Peer(serve_echo) as echo, Peer(serve_robot) as server:
-        ros = roslibpy.Ros("127.0.0.1", echo.ports[0], transport="asyncio")
-        ros.run(timeout=5)
-        there, back = (roslibpy.Topic(ros, name, "std_msgs/String") for name in ("/ping", "/pong"))
-        came = threading.Semaphore(0)
-        back.subscribe(lambda message: came.release())
-        there.advertise()
+    ros = roslibpy.Ros("127.0.0.1", port, transport="asyncio")
+    ros.run(timeout=5)
+    topics = [(roslibpy.Topic(ros, name, kind), message) for name, (kind, message) in sent.items()]
+    came = threading.Semaphore(0)
+    for name, kind in heard.items():
+        roslibpy.Topic(ros, name, kind).subscribe(lambda message: came.release())
+    for topic, _ in topics:
+        topic.advertise()
 
-        def once():
-            there.publish({"data": "ping"})
+    def once():
+        while came.acquire(blocking=False):  # a robot whose time stands still repeats its state now and then
+            pass
+        for topic, message in topics:
+            topic.publish(message)
+        for _ in heard:
             if not came.acquire(timeout=5):
-                raise SettingsError("the echo did not answer")
+                raise SettingsError(f"no answer on {' and '.join(heard)}")
 
+    def close():
+        ros.close()
+        while ros.is_connected:
+            time.sleep(0.01)
+
+    return once, close
+
+
+def measure_link(flags):
+    """RosbridgeRobot's command to state against bare roslibpy: the same messages of the same robot, and an echo."""
+    from bam_envs.robots.ur5e import JOINTS
+
+    reach = {"positions": HOME, "velocities": [0.0] * 6, "time_from_start": {"sec": 0, "nanosec": 100_000_000}}
+    arm = {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}, "joint_names": JOINTS, "points": [reach]}
+    commands = {
+        "/gripper/commands": ("std_msgs/Float64MultiArray", {"layout": {"dim": [], "data_offset": 0}, "data": [0.085]}),
+        "/scaled_joint_trajectory_controller/joint_trajectory": ("trajectory_msgs/JointTrajectory", arm),
+    }
+    states = dict.fromkeys(("/joint_states", "/gripper/joint_states"), "sensor_msgs/JointState")
+    states["/object_pose"] = "geometry_msgs/PoseStamped"
+    ping = {"/ping": ("std_msgs/String", {"data": "ping"})}
+    with Peer(serve_echo) as echo, Peer(serve_robot) as server, Peer(serve_robot) as same:
+        once, close_echo = bare_topics(echo.ports[0], ping, {"/pong": "std_msgs/String"})
+        move, close_same = bare_topics(same.ports[0], commands, states)
         robot, state = live_arm(f"ws://127.0.0.1:{server.ports[0]}")
         ours, count = steps_below_the_gate(robot, state), flags.times(1000)
-        timed(once, count), ours(count)  # warm
-        pairs = [(timed(once, count), ours(count)) for _ in range(flags.times(7))]
+        timed(once, count), timed(move, count), ours(count)  # warm
+        turns = [(timed(once, count), timed(move, count), ours(count)) for _ in range(flags.times(7))]
         robot.close()
-        ros.close()
-    yield percentiles("bare roslibpy topic pair", [one[0] for one in pairs], "ms")
-    yield percentiles("RosbridgeRobot, command to state", [one[1] for one in pairs], "ms")
+        close_same()
+        close_echo()
+    names = "bare roslibpy, a topic pair of an echo", "bare roslibpy, the same messages of the same robot"
+    for what, times in zip((*names, "RosbridgeRobot, command to state"), zip(*turns, strict=True), strict=True):
+        yield percentiles(what, times, "ms")
     for percent in (50, 99):
-        found = np.median([np.percentile(own, percent) / np.percentile(bare, percent) for bare, own in pairs])
-        yield at_most(f"  ratio of p{percent}, median of rounds", found, 2, "x")
+        pair, bare, own = np.median([[np.percentile(times, percent) for times in turn] for turn in turns], axis=0)
+        yield f"  p{percent} / that of the echo: {own / pair:.3g}"
+        yield at_most(f"  p{percent} / that of the same messages", own / bare, 2, "x")
 
 
 STEPS = {

@@ -133,8 +133,10 @@ def test_console(bench):
 def test_link(bench):
     rows = bench("link")
     firsts = (
-        "bare roslibpy topic pair",
-        "  ratio of p50",
+        "bare roslibpy, a topic pair of an echo",
+        "bare roslibpy, the same messages of the same robot",
+        "  p50 / that of the echo: ",
+        "  p50 / that of the same messages",
         "GymAPI step, state",
         "TCP step, state",
         "TCP step, 84 x 84 x 3 image",
