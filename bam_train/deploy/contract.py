@@ -85,8 +85,16 @@ class Contract:
             first, *others = self.refused
             more = f" (and {len(others)} more)" if others else ""
             text = f"{first.what}: expected {first.expected}, found {first.found}{more}"
-            text = f"{who} do not fit: {text}; correct the robot or its profile; {moved}"
+            text = f"{who} do not fit: {text}; {self._remedy()}; {moved}"
             raise ContractRefused(first.what, text, passes=all(line.passes for line in self.refused))
+
+    def _remedy(self) -> str:
+        """What to do about a refused line; a robot that is another one needs another policy."""
+        info = None if self.inspection is None else self.inspection.info
+        if self.inspection is None or info is None or info.name == self.inspection.profile.name:
+            return "correct the robot or its profile"
+        own = self.inspection.profile.name
+        return f"the robot there is {info.name}, and the policy is for {own}: give the address of {own}, or its profile"
 
 
 def check_contract(

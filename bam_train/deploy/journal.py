@@ -229,13 +229,16 @@ def lateness_text(pacer: Pacer) -> str:
 
 
 def guards_text(guards: Mapping[str, Mapping[str, Any]], ticks: int) -> str:
-    """Counts of the guards, such as ``guards changed the command: joint speed (G8) in 3 of 60 ticks (5.0 %)``."""
+    """Counts of the guards, such as ``guards changed the command: joint speed (G8) in 3 of 60 ticks (5.0 %)``.
+
+    On the way to a start pose there are no ticks.
+    """
+
+    def count(times: int) -> str:
+        return f"in {times} of {ticks} ticks ({100 * times / ticks:.1f} %)" if times <= ticks else f"{times} times"
+
     counts = {
-        what: ", ".join(
-            f"{name} ({row['number']}) in {row[what]} of {ticks} ticks ({100 * row[what] / max(1, ticks):.1f} %)"
-            for name, row in guards.items()
-            if row.get(what)
-        )
+        what: ", ".join(f"{name} ({row['number']}) {count(row[what])}" for name, row in guards.items() if row.get(what))
         for what in ("altered", "held")
     }
     changed = f"guards changed the command: {counts['altered']}" if counts["altered"] else "no guard changed a command"

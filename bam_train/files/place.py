@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import errno
 import re
 import shutil
 import tempfile
@@ -201,7 +202,8 @@ class Place:
                 raise PlaceError(self, f"cannot be {done}: {why}") from error
             if not isinstance(error, OSError):
                 raise
-            raise PlaceError(self, f"cannot be {done}: {error.strerror or error}. Check its permissions") from error
+            remedy = "Free some space on its disk" if error.errno == errno.ENOSPC else "Check its permissions"
+            raise PlaceError(self, f"cannot be {done}: {error.strerror or error}. {remedy}") from error
 
 
 class _Reading:

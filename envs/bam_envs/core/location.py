@@ -44,7 +44,8 @@ def is_one_robot(url: str, identity: str) -> bool:
 
 
 def serving(env_id: str, robot_model: object = None) -> str:
-    """The command that serves an environment here, without a port."""
+    """The command that serves an environment here, without a port; a description's table stands for its name."""
+    robot_model = robot_model.get("name") if isinstance(robot_model, Mapping) else robot_model
     name = env_id.rpartition("-v")[0] if env_id.startswith("bam/") and "-v" in env_id else env_id
     model = [] if robot_model is None else ["--robot-model", str(robot_model)]
     return shlex.join(["bam-serve", "--env", name, *model])

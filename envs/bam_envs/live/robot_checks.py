@@ -191,7 +191,8 @@ def _speed(speed: Reading, position: Reading, simulated: bool) -> Check:
 
     Stamps say when both were measured, messages without one when they arrived. Pauses between stamps are left out:
     nothing is known of the motion in them, and the time of a simulation on a busy computer stands still.
-    A simulated gripper at rest on an object may chatter: its measured speed is then not that of a motion.
+    A simulated gripper at rest on an object may chatter: its measured speed is then not that of a motion. The time of a
+    simulation on a busy computer also passes more slowly than the clock, and all its positions change by less.
     """
     name, both = position.source.signal, (speed, position)
     what, expected = f"{speed.source.signal} against {name}", f"equal within {RATE_OFF:g}"
@@ -212,6 +213,10 @@ def _speed(speed: Reading, position: Reading, simulated: bool) -> Check:
     if still:
         return Check(what, expected, "not shown at rest", fits=None)
     found = f"{measured[worst]:.3g} measured, {changed[worst]:.3g} from {name}"
+    slower = float(measured @ changed / (changed @ changed))
+    if simulated and slower > 1 + RATE_OFF and (np.abs(measured - slower * changed) <= RATE_OFF * slower).all():
+        found = f"{slower:.1f} times as fast as {name} changes: the simulation's computer is busy"
+        return Check(what, expected, found, fits=None)
     return Check(what, expected, found, fits=bool(off[worst] <= RATE_OFF))
 
 

@@ -227,6 +227,7 @@ class FirstMotion(Guard):
                 _Way(f"{way} in base_velocity", "base_pose", "rad" if "turn" in way else "m", column)
                 for column, way in enumerate(ways)
             ]
+        self._most = MOST_GAIN
         self._is_base = "base_pose" in sizes
         self._grippers = [(at, spec.command.labels[at], spec.command.high[at]) for at in columns_in(spec.command, "m")]
         self._opening, self._longest = 0, ticks_of(OPENS_WITHIN, spec)
@@ -237,6 +238,10 @@ class FirstMotion(Guard):
     def opens(self) -> bool:
         """Whether the gripper has shown that it opens when it is commanded to, or there is none."""
         return not self._grippers
+
+    def connected(self, *, simulated: bool) -> None:
+        """Take note of a simulated robot, whose time passes more slowly than the clock where its computer is busy."""
+        self._most = math.inf if simulated else MOST_GAIN
 
     def restart(self) -> None:
         """Forget the motion so far: time may have passed without commands."""
@@ -264,7 +269,7 @@ class FirstMotion(Guard):
             self._gaps += 1  # in which a busy computer may have held up the states, or a simulated robot
             return None
         for way in self._ways:
-            if (reason := way.add(changes[way.column], speeds[way.column] * seconds)) is not None:
+            if (reason := way.add(changes[way.column], speeds[way.column] * seconds, self._most)) is not None:
                 return reason
         if all(way.fits for way in self._ways):
             self._ways = []
@@ -310,8 +315,8 @@ class _Way:
     def restart(self) -> None:
         self._by_position = self._by_speed = self._way = 0.0
 
-    def add(self, change: float, by_speed: float) -> str | None:
-        """Take one tick; the reason for a stop if the two differ in two motions, one after the other."""
+    def add(self, change: float, by_speed: float, most: float) -> str | None:
+        """Take one tick; the reason for a stop if the two differ in two motions, by more than `most` times."""
         if self.fits or math.isnan(by_speed):
             return None
         if change * self._way < -STILL * STILL:  # it turns round
@@ -322,7 +327,7 @@ class _Way:
             return None
         measured, told = self._by_position, self._by_speed
         self.restart()
-        if abs(measured) > STILL and LEAST_GAIN <= told / measured <= MOST_GAIN:
+        if abs(measured) > STILL and LEAST_GAIN <= told / measured <= most:
             self.fits = True
             return None
         self._wrong += 1

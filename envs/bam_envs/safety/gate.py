@@ -366,10 +366,12 @@ class SafeRobot(metaclass=Sealed):
         """Connect the robot. Moves nothing."""
         self._robot.connect()
         watchdog, has_agent = getattr(self.info, "watchdog", None), getattr(self.info, "agent", False)
+        simulated = not self._is_real() and not getattr(self._live, "stands_for_a_real_one", False)
         for guard in self._guards:
             if isinstance(guard, Following):
-                yields = not self._is_real() and not getattr(self._live, "stands_for_a_real_one", False)
-                guard.connected(RELAYED * self.spec.period if has_agent else 0.0, yields=yields)
+                guard.connected(RELAYED * self.spec.period if has_agent else 0.0, yields=simulated)
+            if isinstance(guard, FirstMotion):
+                guard.connected(simulated=simulated)
             # A live agent halts the robot by itself, and the watchdog behind it is the agent's concern.
             if isinstance(guard, Watchdog) and not has_agent and (watchdog is not None or self._is_real()):
                 guard.connected(watchdog)

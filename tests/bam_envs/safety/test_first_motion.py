@@ -478,12 +478,20 @@ def test_speeds_that_are_not_the_change_of_the_positions_stop_the_first_motion(s
     assert np.abs(arm.joints[5]) < 0.6
 
 
-@pytest.mark.parametrize(("scale", "stops"), [(1.0, False), (0.4, True), (-1.0, True)])
+@pytest.mark.parametrize(
+    ("scale", "simulated", "stops"),
+    [
+        *((1.0, False, False), (0.4, False, True), (-1.0, False, True), (2.5, False, True)),
+        *((2.5, True, False), (0.4, True, True), (-1.0, True, True)),  # its time passes more slowly than the clock
+    ],
+)
 @pytest.mark.parametrize("frozen", [0, 8], ids=["in time", "a robot that stands still for 0.4 s"])
-def test_states_that_stay_away_are_no_speed_that_is_wrong(scale, stops, frozen):
+def test_states_that_stay_away_are_no_speed_that_is_wrong(scale, simulated, stops, frozen):
     """As of a simulated robot on a busy computer: it stands still, and its last state tells its last speed."""
     spec = WiredArm(known=True).spec
-    guard, period, joints, faults = FirstMotion(spec), spec.period, np.zeros(6), []
+    guard = FirstMotion(spec)
+    guard.connected(simulated=simulated)
+    period, joints, faults = spec.period, np.zeros(6), []
     size, still, age = len(spec.command.labels), 0, 0.0
     for at in range(200):
         still = frozen if at % 12 == 2 else max(0, still - 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import signal
@@ -119,6 +120,11 @@ def test_a_command_line_that_cannot_be_read_is_one_line(arguments, line, capsys,
         (KeyboardInterrupt(), "prog: interrupted\n", 130),
         (KeyboardInterrupt("quit at once"), "prog: quit at once\n", 130),
         (OutputError("two\nlines"), "prog: two lines\n", 1),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "data/pick/info.json"),
+            "prog: data/pick/info.json cannot be written: no space left on its device. Free some, or choose another\n",
+            1,
+        ),
         (MemoryError("4 EiB"), "prog: not enough memory: 4 EiB\n", 1),
         (SettingsError("\x1b[2J\u202egnp"), "prog: \\x1b[2J\\u202egnp\n", 1),
         (SettingsError("x" * 1_000_000), f"prog: {'x' * 2000} ... (1000000 characters)\n", 1),
@@ -180,7 +186,9 @@ def test_a_full_device_behind_standard_output_is_one_line():
         Path("/dev/full").open("w") as full,
         python("from bam_train.cli.envs import main; main([])", stdout=full) as run,
     ):
-        assert run.stderr.read() == "bam-envs: standard output cannot be written: no space left on its device\n"
+        remedy = "Free some, or choose another"
+        text = f"bam-envs: standard output cannot be written: no space left on its device. {remedy}\n"
+        assert run.stderr.read() == text
     assert run.returncode == 1
 
 

@@ -387,6 +387,16 @@ def test_a_mutated_robot_is_refused_by_the_right_line(kind, mutate, what, found)
     assert str(caught.value).endswith("; correct the robot or its profile; nothing has moved")
 
 
+def test_a_robot_of_another_kind_needs_another_policy():
+    arm = Arm()
+    altered(joint_velocity=lambda x: x + 0.66)(arm)
+    arm.info = RobotInfo("fr3")
+    with pytest.raises(ContractRefused) as caught:
+        arm.contract().require("pick.zip and the robot")
+    remedy = "the robot there is fr3, and the policy is for ur5e: give the address of ur5e, or its profile"
+    assert str(caught.value).endswith(f"; {remedy}; nothing has moved")
+
+
 def test_there_are_thirty_mutated_robots_and_more():
     assert len(MUTATIONS) >= 30
 
@@ -409,6 +419,24 @@ def test_a_simulated_gripper_that_chatters_on_an_object_is_no_wrong_speed():
     altered(joint_velocity=lambda x: x + 0.66)(arm)
     arm.info = RobotInfo("ur5e", simulated=True)
     assert "joint_velocity against joint_position" not in refused(arm.contract())
+
+
+@pytest.mark.parametrize(
+    ("scale", "simulated", "verdict", "found"),
+    [
+        (3.4, True, "unknown", "3.4 times as fast as joint_position changes: the simulation's computer is busy"),
+        (3.4, False, "refused", "2.72 measured, 0.8 from joint_position"),
+        (0.5, True, "refused", "0.4 measured, 0.8 from joint_position"),
+        (-3.4, True, "refused", "-2.72 measured, 0.8 from joint_position"),
+    ],
+)
+def test_the_time_of_a_simulation_on_a_busy_computer_passes_slowly(scale, simulated, verdict, found):
+    arm = Arm()
+    arm.speed = 0.8
+    altered(joint_velocity=lambda x: scale * x)(arm)
+    arm.info = RobotInfo("ur5e", simulated=simulated)
+    speed = next(one for one in arm.contract().checks if one.what == "joint_velocity against joint_position")
+    assert (speed.verdict, speed.found) == (verdict, found)
 
 
 @pytest.mark.parametrize("late", [{"stall": 0.3}, {"listening": 0.3}])  # of a simulation, of this computer

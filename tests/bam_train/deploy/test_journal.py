@@ -117,6 +117,7 @@ def test_what_the_guards_did():
     text = "guards changed the command: joint speed (G8) in 3 of 60 ticks (5.0 %)"
     assert guards_text({"joint speed": speed, "finite": finite}, 60) == text
     assert guards_text({"finite": finite}, 60) == "no guard changed a command"
+    assert guards_text({"joint speed": speed}, 0) == "guards changed the command: joint speed (G8) 3 times"
 
 
 def test_the_start_is_measured_once():
