@@ -158,22 +158,13 @@ def guarded(main: Callable[[], int | None], prog: str, signals: SignalMemory | N
             return getattr(error, "exit_status", 1)
         if isinstance(error, BrokenPipeError) or (isinstance(error, OSError) and error.errno == errno.ENOSPC):
             # Standard output is closed, as by head, or full; Python would complain about what its buffer still holds.
-            where = "standard output" if _is_cut(sys.stdout) else error.filename or "a file"
             drop(sys.stdout)
             if error.errno == errno.ENOSPC:
+                where = error.filename or "standard output, or a file that it writes,"
                 _complain(prog, f"{where} cannot be written: no space left on its device. Free some, or choose another")
         else:
             raise
     return 1
-
-
-def _is_cut(stream: Any) -> bool:
-    """Whether what is in the buffer of `stream` cannot be written."""
-    try:
-        stream.flush()
-    except (OSError, ValueError):
-        return True
-    return False
 
 
 def _complain(prog: str, text: str) -> None:

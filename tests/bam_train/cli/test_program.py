@@ -187,8 +187,8 @@ def test_a_full_device_behind_standard_output_is_one_line():
         python("from bam_train.cli.envs import main; main([])", stdout=full) as run,
     ):
         remedy = "Free some, or choose another"
-        text = f"bam-envs: standard output cannot be written: no space left on its device. {remedy}\n"
-        assert run.stderr.read() == text
+        what = "standard output, or a file that it writes, cannot be written"
+        assert run.stderr.read() == f"bam-envs: {what}: no space left on its device. {remedy}\n"
     assert run.returncode == 1
 
 
