@@ -21,9 +21,9 @@ test: $(VENV)/.dev peers
 	echo "Once more, one at a time, what failed above. What passes now depends on the load of the machine: mend it." && \
 	$(BIN)/python -m pytest --last-failed --last-failed-no-failures none --verbose; }
 
-# Without what needs Ray or ROS 2 or trains.
+# Without what needs Ray or ROS 2, trains, or runs whole programs, live agents and tasks.
 quick: $(VENV)/.dev
-	$(BIN)/python -m pytest $(WORKERS) -m "not (slow or ray or peers or training)"
+	$(BIN)/python -m pytest $(WORKERS) -m "not (slow or ray or peers or training or whole)"
 
 # Every figure against its goal, on an idle machine in some hours; python -m tests.benchmarks lists them.
 benchmarks: $(VENV)/.dev

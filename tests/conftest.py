@@ -57,6 +57,19 @@ KINDS = {
         "bam_train/files/test_addresses.py",
         "bam_train/cli/test_elsewhere.py",
     ),
+    "whole": (
+        "bam_train/agent",
+        "bam_envs/robots/modelling",
+        "bam_envs/tasks",
+        "bam_train/cli",
+        "bam_train/trainers",
+        "bam_train/data",
+        "bam_train/deploy",
+        "bam_train/recording",
+        "bam_train/test_detector.py",
+        "bam_envs/safety/test_any_arm.py",
+        "bam_envs/core/test_robot_vector_env.py",
+    ),
 }
 """Marker to the folders and files whose tests have it, the longest first; `make quick` leaves them all out."""
 
