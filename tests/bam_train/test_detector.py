@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bam_train.checkpoint import Checkpoint, safetensors_file
-from bam_train.checkpoint.added_members import add_members
+from bam_train.checkpoint.checkpoint import add_members
 from bam_train.checkpoint.detector import DETECTOR, REASONS, Detector, Rollout, make_detector
 from bam_train.cli.eval import main as bam_eval
 from bam_train.errors import CheckpointError, SettingsError
