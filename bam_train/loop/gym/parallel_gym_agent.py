@@ -1,4 +1,4 @@
-"""Single Gymnasium environments as one agent: BBRL's `ParallelGymAgent`, bit for bit, several times as fast; videos of one.
+"""Single Gymnasium environments as one agent: BBRL's `ParallelGymAgent`, bit for bit, several times as fast; videos.
 
 Differences from bbrl 1.0.1:
 
