@@ -17,6 +17,7 @@ Reading never unpickles.
 from __future__ import annotations
 
 import contextlib
+import copy
 import hashlib
 import json
 import math
@@ -194,3 +195,44 @@ def write_checkpoint(path: str | Path, manifest_fields: Mapping[str, Any], membe
         why = error.strerror or error
         raise OutputError(f"{path}: cannot be written: {why}. Choose another place with --out") from error
     return Checkpoint(path, parse_manifest(path, manifest), hashlib.sha256(manifest).hexdigest())
+
+
+def add_members(path: str | Path, members: Mapping[str, bytes]) -> Checkpoint:
+    """Add members to the checkpoint at `path`, or replace them; its manifest and digest change.
+
+    A signature is removed, since it was of the manifest before.
+
+    Raises:
+        CheckpointError: The checkpoint is damaged.
+        OutputError: The file cannot be written, and is unchanged.
+    """
+    checkpoint = Checkpoint.open(path)
+    manifest = json.loads(checkpoint.manifest_bytes())
+    added = {name: hashlib.sha256(data).hexdigest() for name, data in members.items()}
+    manifest["sha256"] = dict(sorted({**manifest["sha256"], **added}.items()))
+    replace_members(checkpoint, {**members, MANIFEST: json.dumps(manifest, indent=2, allow_nan=False).encode()})
+    return Checkpoint.open(path)
+
+
+def replace_members(checkpoint: Checkpoint, members: Mapping[str, bytes]) -> None:
+    """Replace members of the file, and remove its signature if no other is among them; nothing else changes.
+
+    Raises:
+        CheckpointError: The checkpoint is damaged.
+        OutputError: The file cannot be written, and is unchanged.
+    """
+    target, digests = Path(os.path.realpath(checkpoint.path)), checkpoint.manifest.sha256
+    with open_zip(target) as source:
+        infos = list_members(target, source)
+        try:
+            with replacing(target) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+                for name, info in infos.items():
+                    if name != SIGNATURE and name not in members:
+                        with archive.open(copy.copy(info), "w", force_zip64=info.file_size > 2**31) as writer:
+                            for chunk in chunks(target, source, info, digests.get(name)):
+                                writer.write(chunk)
+                for name, data in members.items():
+                    write_member(archive, name, data)
+        except OSError as error:  # caught here: `open_zip` would report a file that cannot be read
+            why = error.strerror or error
+            raise OutputError(f"{checkpoint.path}: cannot be written: {why}. Make room beside it") from error

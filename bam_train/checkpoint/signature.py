@@ -20,8 +20,7 @@ import msgspec
 from msgspec import Meta
 
 from bam_envs.core.location import config_folder
-from bam_train.checkpoint.added_members import replace_members
-from bam_train.checkpoint.checkpoint import Checkpoint
+from bam_train.checkpoint.checkpoint import Checkpoint, replace_members
 from bam_train.checkpoint.manifest import AGAIN, MANIFEST
 from bam_train.checkpoint.ownership import who_else
 from bam_train.checkpoint.zip_members import RESUME, SIGNATURE, chunks, list_members, open_zip

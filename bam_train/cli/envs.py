@@ -26,7 +26,7 @@ def show_environments(config: EnvsConfig) -> None:
 
 def overview() -> list[dict[str, Any]]:
     """Facts of each environment of `bam_envs`, as JSON values; imports no simulator."""
-    from bam_envs.aliases.robo_gym_names import ROBO_GYM
+    from bam_envs.aliases import ROBO_GYM
     from bam_envs.core.registry import ENVIRONMENTS, resolve
     from bam_envs.core.spaces import space_text
 
@@ -47,7 +47,7 @@ def overview() -> list[dict[str, Any]]:
 
 def overview_lines(facts: list[dict[str, Any]]) -> list[str]:
     """The environments as a table, then robo-gym's names for them, two ids in a line."""
-    from bam_envs.aliases.bam_names import BAM_NAMES
+    from bam_envs.aliases import BAM_NAMES
 
     keys = ("id", "observation", "action", "episode_steps", "rate_hz", "summary")
     cells = [[f"{env[key]:g}" if key == "rate_hz" else str(env[key]) for key in keys] for env in facts]
@@ -61,7 +61,7 @@ def overview_lines(facts: list[dict[str, Any]]) -> list[str]:
 
 def details(name: str, arm: str | None = None) -> dict[str, Any]:
     """All facts of one environment with the arm of that name, as JSON values; makes it, so it needs its simulator."""
-    from bam_envs.aliases.robo_gym_names import ROBO_GYM
+    from bam_envs.aliases import ROBO_GYM
     from bam_envs.core.registry import entry_of, resolve_id
     from bam_envs.core.spaces import space_to_json
     from bam_train.environments import described, make_env, require_env_kwargs
@@ -103,7 +103,7 @@ def _cannot(env: Any) -> str | None:
 
 def detail_lines(facts: dict[str, Any]) -> list[str]:
     """The facts of `details` as lines for people."""
-    from bam_envs.aliases.bam_names import BAM_NAMES
+    from bam_envs.aliases import BAM_NAMES
 
     lines = [facts["id"] if facts["summary"] is None else f"{facts['id']}: {facts['summary']}"]
     if facts["same_as"] is not None:

@@ -60,7 +60,7 @@ def _network(config: ExportConfig, kind: str, path: Path) -> Exported:
 
         policy = lerobot_policy(path, data=config.data, units=config.units)
     else:
-        from bam_train.compat.described_policy import described_policy
+        from bam_train.compat.foreign_policy import described_policy
 
         policy = described_policy(path)
     env = resolve_id(config.env or policy.env or JOINTS)

@@ -10,7 +10,7 @@ import gymnasium as gym
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
-from bam_envs.aliases.robo_gym_names import ROBO_GYM
+from bam_envs.aliases import ROBO_GYM
 from bam_envs.core import registry
 from bam_envs.core.env_options import in_our_words, require_kinds
 from bam_envs.core.errors import BamEnvsError, InvalidValue, UnknownName

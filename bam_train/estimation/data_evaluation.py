@@ -15,8 +15,14 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.data import DataSet
 from bam_train.environments import first_difference, interface_pairs, names_and_units
 from bam_train.errors import BadDataSet, CheckpointMismatch
-from bam_train.estimation.behaviour import action_ratios
-from bam_train.estimation.estimates import Array, Estimate, doubly_robust, importance_sampling, self_normalised
+from bam_train.estimation.estimates import (
+    Array,
+    Estimate,
+    action_ratios,
+    doubly_robust,
+    importance_sampling,
+    self_normalised,
+)
 from bam_train.estimation.fitted_q import FittedQ, fit_q
 from bam_train.estimation.steps import Steps, read_steps
 from bam_train.evaluation import wilson_interval

@@ -17,25 +17,23 @@ from bam_train.loop.workspace.workspace import Workspace
 
 if TYPE_CHECKING:
     from bam_train.loop.gym.gym_agent import GymAgent as GymAgent
-    from bam_train.loop.gym.observing_agents import ObservingAgents as ObservingAgents
     from bam_train.loop.gym.parallel_gym_agent import ParallelGymAgent as ParallelGymAgent
     from bam_train.loop.gym.parallel_gym_agent import make_env as make_env
+    from bam_train.loop.gym.parallel_gym_agent import record_video as record_video
+    from bam_train.loop.gym.robot_agent import ObservingAgents as ObservingAgents
     from bam_train.loop.gym.robot_agent import PolicyAgent as PolicyAgent
     from bam_train.loop.gym.robot_agent import RobotAgent as RobotAgent
     from bam_train.loop.gym.vec_gym_agent import VecGymAgent as VecGymAgent
-    from bam_train.loop.gym.video_agent import record_video as record_video
     from bam_train.loop.workspace.replay_buffer import ReplayBuffer as ReplayBuffer
     from bam_train.loop.workspace.returns import gae as gae
 
 _ON_USE = {
     "loop.gym.gym_agent": ("GymAgent",),
-    "loop.gym.parallel_gym_agent": ("ParallelGymAgent", "make_env"),
+    "loop.gym.parallel_gym_agent": ("ParallelGymAgent", "make_env", "record_video"),
     "loop.gym.vec_gym_agent": ("VecGymAgent",),
-    "loop.gym.robot_agent": ("PolicyAgent", "RobotAgent"),
-    "loop.gym.observing_agents": ("ObservingAgents",),
+    "loop.gym.robot_agent": ("ObservingAgents", "PolicyAgent", "RobotAgent"),
     "loop.workspace.replay_buffer": ("ReplayBuffer",),
     "loop.workspace.returns": ("cumulated_reward", "doubleqlearning_temporal_difference", "gae", "temporal_difference"),
-    "loop.gym.video_agent": ("record_video",),
     "compat.bbrl.conventions": (
         *("SeedableAgentLast", "SeedableAgentMean", "SeedableAgentSum", "SerializableAgent", "TimeAgent", "load"),
         *("get_arguments", "get_class", "instantiate_class"),

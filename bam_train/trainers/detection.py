@@ -13,7 +13,7 @@ from gymnasium.vector import VectorEnv
 from bam_envs.core.robot_env import RobotVectorEnv
 from bam_envs.robots.live_like import LiveLike
 from bam_train.checkpoint import Checkpoint
-from bam_train.checkpoint.added_members import add_members
+from bam_train.checkpoint.checkpoint import add_members
 from bam_train.checkpoint.detector import DETECTOR, LEAST_TICKS, MOST_NUMBERS, Detector, Rollout, make_detector, vectors
 from bam_train.data.recorded_episode import Episode
 from bam_train.environments import make_vector_env

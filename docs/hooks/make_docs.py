@@ -321,7 +321,7 @@ def algorithms(trainer: str = "sb3") -> str:
 
 def robo_gym() -> str:
     """The table of robo-gym's ids; its two ids of one environment are one row."""
-    from bam_envs.aliases.robo_gym_names import ROBO_GYM
+    from bam_envs.aliases import ROBO_GYM
 
     rows = []
     for entry in (entry for entry in ROBO_GYM.values() if not entry.is_live):

@@ -20,8 +20,8 @@ from bam_train.checkpoint import GOLDEN, MANIFEST, POLICY, safetensors_file, wri
 from bam_train.cli.flags import TrainConfig
 from bam_train.cli.program import guarded
 from bam_train.cli.train import train
-from bam_train.compat.described_policy import described_policy
 from bam_train.compat.foreign_export import export_foreign
+from bam_train.compat.foreign_policy import described_policy
 from tests.one_ray import no_ray_fixture, one_ray_fixture, shared_ray_fixture  # noqa: F401
 
 

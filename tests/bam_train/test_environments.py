@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from bam_envs.aliases.robo_gym_names import ROBO_GYM
+from bam_envs.aliases import ROBO_GYM
 from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.core.robot_models import portable_model
 from bam_envs.core.spaces import space_to_json

@@ -9,7 +9,7 @@ from collections import Counter
 
 import numpy as np
 
-from bam_train.estimation.paired_test import Pairs
+from bam_train.estimation.release_gate import Pairs
 from tests.benchmarks.harness import at_most
 
 CASES = (

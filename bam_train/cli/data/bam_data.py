@@ -166,7 +166,7 @@ def export_data(config: flags.ExportDataConfig) -> None:
 
 def show_info(config: flags.InfoConfig) -> None:
     """Say what a data set is of."""
-    from bam_train.data.views.summary import groups
+    from bam_train.cli.data.views import groups
 
     data = _open(config.place)
     info, found = data.info, groups(data) if len(data) else []
@@ -228,7 +228,7 @@ def filter_data(config: flags.FilterConfig) -> None:
 
 def show_stats(config: flags.StatsConfig) -> None:
     """Print tables of groups and numbers."""
-    from bam_train.data.views.summary import groups, numbers
+    from bam_train.cli.data.views import groups, numbers
     from bam_train.files.log_lines import aligned
 
     data = _open(config.place)
@@ -248,7 +248,7 @@ def show_stats(config: flags.StatsConfig) -> None:
 
 def plot_data(config: flags.PlotConfig) -> None:
     """Draw a data set."""
-    from bam_train.data.views.figures import plot
+    from bam_train.cli.data.views import plot
     from bam_train.files.pictures import require_picture_path
 
     path = require_picture_path(config.out)
@@ -261,7 +261,7 @@ def plot_data(config: flags.PlotConfig) -> None:
 
 def show_episode(config: flags.ShowConfig) -> None:
     """Make a film of an episode."""
-    from bam_train.data.views.film import frames
+    from bam_train.cli.data.views import frames
     from bam_train.files.video import open_video, require_video_path
 
     path = require_video_path(config.out)

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 
 from bam_envs import make_env as ours
-from bam_envs.aliases.robo_gym_names import ROBO_GYM, RoboGymId
+from bam_envs.aliases import ROBO_GYM, RoboGymId
 from bam_envs.core.env_options import in_our_words, require_kinds
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.registry import ENVIRONMENTS, MAKE_OPTIONS

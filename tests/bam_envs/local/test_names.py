@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.aliases.bam_names import BAM_NAMES
+from bam_envs.aliases import BAM_NAMES
 from bam_envs.core.errors import UnknownName
 from bam_envs.core.registry import are_same, entry_of, resolve_id
 from bam_envs.local.bandits import ContextBandit

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import bam_envs
-from bam_envs.aliases.robo_gym_names import ROBO_GYM
+from bam_envs.aliases import ROBO_GYM
 from bam_envs.core.errors import InvalidValue, ResetNeeded
 from bam_envs.robo_gym.rs_state import MIR_LENGTH, UR_KEYS
 

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from bam_envs.aliases.robo_gym_names import ROBO_GYM
+from bam_envs.aliases import ROBO_GYM
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.robo_gym.making import constructor_options, say_once, translate
 

@@ -5,7 +5,7 @@ import gymnasium as gym
 import pytest
 
 from bam_envs import ENVIRONMENTS
-from bam_envs.aliases.robo_gym_names import ROBO_GYM
+from bam_envs.aliases import ROBO_GYM
 from bam_envs.core.registry import are_same, entry_of, resolve_id
 
 STEMS = {
@@ -46,8 +46,7 @@ print(sorted(name for name in sys.modules if name.startswith("bam_envs.")))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     core = ("env_options", "errors", "location", "registry", "robot", "validation", "wording")
-    others = ("aliases", "aliases.bam_names", "aliases.robo_gym_names")
-    modules = [*others, "core", *(f"core.{name}" for name in core)]
+    modules = ["aliases", "core", *(f"core.{name}" for name in core)]
     assert done.stdout.strip() == str([f"bam_envs.{name}" for name in modules])
 
 

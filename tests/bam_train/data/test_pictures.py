@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from bam_train.cli.data.bam_data import main
+from bam_train.cli.data.views import frames
 from bam_train.data import DataSet, RecordDataset
-from bam_train.data.views.film import frames
 from bam_train.errors import SettingsError
 from tests.bam_train.data.export.test_export import record
 

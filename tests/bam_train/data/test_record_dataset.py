@@ -11,9 +11,9 @@ from gymnasium.vector import AutoresetMode
 import bam_envs  # noqa: F401
 from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend
 from bam_train.cli.data import bam_data
+from bam_train.cli.data.views import numbers
 from bam_train.data import DataSet, RecordDataset
 from bam_train.data.collect import collect
-from bam_train.data.views.summary import numbers
 from bam_train.errors import BadDataSet, SettingsError
 
 pytest.importorskip("pyarrow")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bam_train.estimation.paired_test import Pairs, verdict_of
+from bam_train.estimation.release_gate import Pairs, verdict_of
 from tests.checks import gate
 
 

@@ -47,8 +47,9 @@ def test_navigation_drives_to_the_target_from_where_the_base_is(serve, make, opt
             break
     if options:
         assert (reward, info["final_status"], info["is_success"]) == (2.0, "success", True)
-    else:  # a few steps of real time are enough
-        assert served.env.unwrapped.robot.state.signals["base_velocity"].any()
+    else:  # a few steps of real time are enough; on a busy computer it may stand again by now
+        moved = served.env.unwrapped.robot.state.signals["base_pose"] - [0.4, -0.3, 0.7]
+        assert np.abs(moved).max() > 0.01
 
 
 @pytest.mark.parametrize("model", ["mir100", "turtlebot4", CART])

@@ -1,19 +1,25 @@
-"""Draw a data set: episodes side by side, distributions of its numbers, success over time, failures on the table."""
+"""What a person sees of a data set: tables of its groups and numbers, the film of an episode, and drawings."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bam_envs.core.spaces import leaves_by_path, part_at
+from bam_envs.core.wording import did_you_mean
 from bam_train.data.data_set import DataSet
 from bam_train.data.data_set_writer import require_same
-from bam_train.data.recorded_episode import Array, Episode
+from bam_train.data.recorded_episode import Array, Episode, Leaf
+from bam_train.environments import make_env, must_be_named
 from bam_train.errors import SettingsError
+from bam_train.evaluation import wilson_interval
 from bam_train.files.pictures import new_figure, require_picture_path, save_figure
+from bam_train.files.video import Frame, picture
 from bam_train.recording.recorder import number_names
 
 if TYPE_CHECKING:
@@ -23,6 +29,118 @@ KINDS = ("episodes", "numbers", "success", "table")
 MOST_NUMBERS, MOST_SAMPLES, MOST_EPISODES = 48, 300, 6
 _WINDOW = 20
 """Episodes of the running success."""
+_SAME = 1e-4
+"""Largest difference of an observation that is played again from the recorded one."""
+
+
+def groups(data: DataSet, by: str | None = None) -> list[dict[str, Any]]:
+    """A row for each value of the fact `by`, or one for all episodes.
+
+    Keys: group, episodes, steps, successes (None if unknown), success and its 95 % interval, mean and deviation of the
+    returns, mean length.
+    """
+    rows = [data.facts(index) for index in range(len(data))]
+    if by is not None and rows and not any(by in row for row in rows):
+        known = {name for row in rows for name in row}
+        raise SettingsError(f"--by: no episode of {data.place} has {by!r}. {did_you_mean(by, known)}")
+    found: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        found["all" if by is None else str(row.get(by, "-"))].append(row)
+    return [_group(name, members) for name, members in found.items()]
+
+
+def _group(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    known = [row["success"] for row in rows if row["success"] is not None]
+    lengths, returns = [row["length"] for row in rows], [row["return"] for row in rows]
+    return {
+        "group": name,
+        "episodes": len(rows),
+        "steps": sum(lengths),
+        "successes": sum(known) if known else None,
+        "success": float(np.mean(known)) if known else None,
+        "success_interval": list(wilson_interval(sum(known), len(known))) if known else None,
+        "mean_return": float(np.mean(returns)),
+        "std_return": float(np.std(returns)),
+        "mean_length": float(np.mean(lengths)),
+    }
+
+
+def numbers(data: DataSet) -> list[dict[str, Any]]:
+    """A row for each number of a step: column, name, unit, min, q01, q50, q99, max, mean and std.
+
+    A number that is scaled (`Label.scale`) has no unit any more, and its row says so.
+    """
+    stats = data.stats()
+    units = {
+        column: [_unit(one) for one in data.info.contract.get(kind) or ()]
+        for column, kind in (("observation.state", "observation"), ("action", "action"), ("command", "command"))
+    }
+    rows = []
+    for column, found in stats.items():
+        names = data.features[column]["names"] or []
+        flat = {key: np.ravel(values) for key, values in found.items()}
+        for i in range(len(flat["mean"])):
+            name = str(names[i]) if len(names) == len(flat["mean"]) else str(i) if len(flat["mean"]) > 1 else ""
+            unit = units.get(column, [])[i] if len(units.get(column, [])) == len(flat["mean"]) else ""
+            values = {key: float(flat[key][i]) for key in ("min", "q01", "q50", "q99", "max", "mean", "std")}
+            rows.append({"column": column, "name": name, "unit": unit, **values})
+    return rows
+
+
+def _unit(row: Mapping[str, Any]) -> str:
+    """The unit of the numbers of a column as they are recorded, by its row in the contract."""
+    return str(row.get("unit") or "") if row.get("scale", "1") == "1" else "scaled"
+
+
+def frames(data: DataSet, index: int, camera: str | None = None) -> Iterator[Frame]:
+    """The pictures of an episode, RGB. Shape of each: (height, width, 3).
+
+    Raises:
+        SettingsError: There are no pictures, and the episode cannot be played again: its seed is not known, its
+            environment is not this one's, or it goes another way.
+    """
+    episode = data[index]
+    cameras = {leaf.column.removeprefix("observation.images."): leaf for leaf in _cameras(data)}
+    if camera is not None and not cameras:
+        raise SettingsError(f"--camera: {data.place} has no recorded pictures; leave it out")
+    if camera is not None and camera not in cameras:
+        raise SettingsError(f"--camera: {data.place} has no {camera!r}. {did_you_mean(camera, cameras)}")
+    if cameras:
+        leaf = cameras[camera or next(iter(cameras))]
+        for pixels in leaf.of(episode.observations):
+            yield np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[:, :, :3]
+        return
+    yield from _played(data, index, episode)
+
+
+def _cameras(data: DataSet) -> list[Leaf]:
+    return [leaf for leaf in data.info.observation_leaves if leaf.is_image]
+
+
+def _played(data: DataSet, index: int, episode: Episode) -> Iterator[Frame]:
+    what = f"{data.place}: episode {index} has no pictures"
+    if "seed" not in episode.facts:
+        raise SettingsError(f"{what}, and its seed is not known; show one with a seed, or record pictures")
+    if must_be_named(data.info.env):
+        raise SettingsError(f"{what}, and {data.info.env} is in a module that is not installed as trusted")
+    env = make_env(data.info.env, data.info.env_kwargs, render_mode="rgb_array")
+    try:
+        observation, _ = env.reset(seed=int(episode.facts["seed"]))
+        for step in range(len(episode) + 1):
+            if not _is_same(observation, episode.observations, step):
+                raise SettingsError(
+                    f"{what}, and played again it differs from step {step} on; its environment was another one"
+                )
+            yield picture(env)
+            if step < len(episode):
+                observation, *_ = env.step(episode.actions[step])
+    finally:
+        env.close()  # type: ignore[no-untyped-call]
+
+
+def _is_same(found: object, recorded: object, step: int) -> bool:
+    pairs = [(part_at(found, path), array[step]) for path, array in leaves_by_path(recorded)]
+    return all(np.allclose(one, other, rtol=_SAME, atol=_SAME, equal_nan=True) for one, other in pairs)
 
 
 def plot(

@@ -1,6 +1,7 @@
-"""The table of robo-gym's ids: the environment of each id in `bam_envs`, and robo-gym's other defaults.
+"""Other ids of these environments: BAM's and former ones, and the table of robo-gym's; importing this is cheap.
 
-`register` adds them, and robo-gym's arithmetic as the flag ``parity`` of the environments; importing this is cheap.
+For each id of robo-gym the table has the environment in `bam_envs`, and robo-gym's other defaults. `register` adds all
+ids, and robo-gym's arithmetic as the flag ``parity`` of the environments.
 """
 
 from collections.abc import Mapping
@@ -8,6 +9,22 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bam_envs.core.registry import ENVIRONMENTS, Alias, register_alias
+
+_SEED = {"seed": "table_seed"}
+BAM_NAMES = {
+    "GridWorldEnv-v0": Alias("bam/grid-world-v0"),
+    "ClassicBandit-v0": Alias("bam/classic-bandit-v0", options=_SEED),
+    "ContextBandit-v0": Alias("bam/context-bandit-v0", options=_SEED),
+    "MNISTEnv-v0": Alias("bam/mnist-v0"),
+    "GraspXY-v0": Alias("bam/grasp-xy-v0"),
+    "ObsEnv-v0": Alias("bam/obs-v0"),
+    "GraspXYR-v0": Alias("bam/grasp-xyr-v0"),
+}
+FORMER_NAMES = {
+    "bam/mir100-navigation-v0": Alias("bam/navigation-v0"),
+    "bam/mir100-avoidance-v0": Alias("bam/avoidance-v0"),
+}
+"""Ids from before these tasks were for any base, in checkpoints and in people's commands."""
 
 _UR = {"ur_model": "ur5", "rs_state_to_info": True}
 _UR_MODULAR = {"ur_model": "ur5", "rs_state_to_info": False}
@@ -71,8 +88,10 @@ PARITY = {
 
 
 def register() -> None:
-    """Add robo-gym's ids, and the flag ``parity`` to their environments; idempotent."""
+    """Add these ids, and the flag ``parity`` to robo-gym's environments; idempotent."""
     for env_id, task in PARITY.items():
         ENVIRONMENTS[env_id].variants["parity"] = task
     for entry in ROBO_GYM.values():
         register_alias(entry.id, Alias(entry.env_id, entry.variant), "bam_envs.robo_gym.making")
+    for name, alias in {**BAM_NAMES, **FORMER_NAMES}.items():
+        register_alias(name, alias, "bam_envs.make_env", ENVIRONMENTS[alias.env_id].time_limit)
