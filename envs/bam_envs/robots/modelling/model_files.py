@@ -304,7 +304,7 @@ def _readable(file: str, folder: str) -> str:
 
 def _mesh_file(path: Path, name: str) -> str:
     """The file of a mesh: ``package://NAME/...`` is looked for in the folders above the URDF."""
-    package, rest = re.match(r"(?:package://([^/]+)/|file://)?(.*)", name).groups()  # type: ignore[union-attr]
+    package, rest = re.match(r"(?:package:///?([^/]+)/|file://)?(.*)", name).groups()  # type: ignore[union-attr]
     tails = [rest] if package is None else [rest, f"{package}/{rest}"]
     for folder in path.resolve().parents:
         for tail in tails:

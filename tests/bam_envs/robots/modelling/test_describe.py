@@ -583,7 +583,10 @@ def test_an_arm_that_faces_another_way_is_turned_to_face_x(described, tmp_path):
     )
 
 
-@pytest.mark.parametrize("name", ["package://lab_description/meshes/w.obj", "meshes/w.obj"])
+@pytest.mark.parametrize(
+    "name",
+    ["package://lab_description/meshes/w.obj", "package:///lab_description/meshes/w.obj", "meshes/w.obj"],
+)
 def test_a_mesh_that_is_beside_the_file_is_found(tmp_path, name):
     """Also where the ROS package is not installed."""
     path = tmp_path / "lab_description" / "urdf" / "lab.urdf"
