@@ -67,7 +67,7 @@ def _obstacle(arms: Sequence[ArmDescription]) -> str:
         chain, outline = arm.chain, Outline(arm.chain)
         for box in _boxes(chain, _SCALES[-1]):
             homes = _homes(chain, outline, box)[:4]
-            found += [flaw(dataclasses.replace(chain, home=home), outline, box) for _, home in homes]
+            found += [uncovered(dataclasses.replace(chain, home=home), outline, box) for _, home in homes]
             found += [] if homes else [_no_home(chain, outline, _middle(box))]
     return max(found, key=itemgetter(0))[1]
 
@@ -100,7 +100,7 @@ def _areas(arm: ArmDescription, scale: float) -> Iterator[ArmDescription]:
         for margin, home in _homes(chain, outline, box)[:4]:
             if margin <= best:
                 break
-            if not flaw(dataclasses.replace(chain, home=home), outline, box)[1]:
+            if not uncovered(dataclasses.replace(chain, home=home), outline, box)[1]:
                 low, high = (tuple(round(float(one), 4) for one in corner) for corner in box)
                 area: Any = {"home": tuple(map(float, home)), "workspace": (low, high)}
                 yield dataclasses.replace(arm, **area)
@@ -169,7 +169,7 @@ def _down(chain: SerialChain, point: Array) -> tuple[Array, NDArray[np.bool_]]:
     return q, _reaches(chain, q, wanted, np.zeros(_TRIES))
 
 
-def flaw(chain: SerialChain, outline: Outline, box: Array) -> tuple[float, str]:
+def uncovered(chain: SerialChain, outline: Outline, box: Array) -> tuple[float, str]:
     """Whether the arm follows straight lines from the middle of `box` to all sides of it, with the gripper turned.
 
     Returns:

@@ -381,13 +381,7 @@ def resolve_id(name: str) -> str:
         _import_for(module, name)
     versions = [spec for spec in gym.registry.values() if bare and bare in (spec.id, spec.id.rpartition("-v")[0])]
     if not versions:
-        from bam_envs.core.robot_models import known_models  # which imports this module
-
-        examples, remedy = [*ENVIRONMENTS, "another of Gymnasium's"], ""
-        if name in known_models():
-            examples = [known for known, one in ENVIRONMENTS.items() if "robot_model" in one.options()]
-            remedy = f"{name} is a robot: name it with --robot-model {name}, beside an environment."
-        raise UnknownName("environment", name, gym.registry, examples=examples, remedy=remedy)
+        raise UnknownName("environment", name, gym.registry, examples=[*ENVIRONMENTS, "another of Gymnasium's"])
     newest = max(versions, key=lambda spec: spec.version or 0).id
     return f"{module}:{newest}" if module else newest
 

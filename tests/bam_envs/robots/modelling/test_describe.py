@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bam_envs.arms.capsules import Outline
-from bam_envs.arms.work_area import flaw
+from bam_envs.arms.work_area import uncovered
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot_models import read_description
 from bam_envs.robots.modelling.describe import as_toml, describe, joint_rows
@@ -228,7 +228,7 @@ def test_it_is_read_as_it_was_written(described, name, tmp_path):
 def test_the_whole_work_area_is_reached(described, name):
     arm, _ = described[name]
     box = np.array(arm.workspace)
-    assert flaw(arm.chain, Outline(arm.chain), box) == (3.0, "")
+    assert uncovered(arm.chain, Outline(arm.chain), box) == (3.0, "")
     assert box[0, 2] == 0.016
     assert (box[1] - box[0] >= [0.1, 0.12, 0.04]).all()
 
