@@ -125,7 +125,7 @@ def _base_facts(base: BaseDescription) -> list[tuple[str, str, bool]]:
 def _facts(arm: ArmDescription) -> list[tuple[str, str, bool]]:
     """What is measured of an arm: name, text, and whether it is as it should be."""
     from bam_envs.arms.capsules import Outline
-    from bam_envs.arms.work_area import covers
+    from bam_envs.arms.work_area import uncovered
 
     chain, outline = arm.chain, Outline(arm.chain)
     rng = np.random.default_rng(0)
@@ -133,7 +133,7 @@ def _facts(arm: ArmDescription) -> list[tuple[str, str, bool]]:
     reach = float(np.linalg.norm(chain.tool_position(q) - chain.placements[0, :3, 3], axis=1).max())
     off = _simulated_gap(arm, q)
     clear = float(min(outline.nearest(chain.home[None])[0], outline.lowest(chain.home[None])[0]))
-    reached = covers(chain, outline, np.array(arm.workspace))
+    _, missed = uncovered(chain, outline, np.array(arm.workspace))
     share = float((outline.nearest(q) < 0.0).mean())
     flaw = _outline_flaw(arm, outline)
     turns = "position and turn of the gripper" if chain.turns else "position only: this arm cannot turn its gripper"
@@ -148,7 +148,7 @@ def _facts(arm: ArmDescription) -> list[tuple[str, str, bool]]:
             f"{len(arm.capsules)} capsules, {len(outline.pairs)} pairs; {share:.0%} of all postures touch{flaw}",
             not flaw,
         ),
-        ("work area", _area(arm) + ("" if reached else ": not all of it is reached"), reached),
+        ("work area", _area(arm) + (f": not all of it is reached: {missed}" if missed else ""), not missed),
     ]
 
 

@@ -108,13 +108,19 @@ def _checked_place(config: PlayConfig) -> Location:
 
 def _connected(config: PlayConfig, place: Location, checkpoint: Checkpoint | None, signals: SignalMemory) -> Any:
     """The environment, connected and with consent, and the policy, if there is one."""
+    from bam_envs.arms.description import ArmDescription
     from bam_envs.core.registry import resolve_id
+    from bam_envs.core.robot_models import Description, find_model, known_models
     from bam_train.cli.consent import connected_env
     from bam_train.deploy.checkpoint_admission import Admission
     from bam_train.environments import require_env_kwargs
     from bam_train.settings import read_env_kwargs
 
     kwargs = read_env_kwargs(config.set)
+    if config.env in known_models():
+        is_arm = isinstance(find_model(config.env, Description), ArmDescription)
+        play = f"bam-play bam/{'pick' if is_arm else 'navigation'} --robot-model {config.env}"
+        raise SettingsError(f"{config.env} is a robot; name an environment too, such as {play}.")
     named = None if config.env is None else resolve_id(config.env)
     if named is not None:
         require_env_kwargs(named, kwargs)

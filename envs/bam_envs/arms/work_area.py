@@ -2,7 +2,9 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,7 @@ TABLE_END = 0.88
 """Farthest x of a work area: the table ends at 0.95 m."""
 YAW = 1.2
 """Farthest turn of the gripper from straight ahead [rad]."""
-_SCALES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.42, 0.35, 0.3, 0.25)
+_SCALES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.42, 0.35, 0.3, 0.25, 0.2)
 _HEIGHTS = (1.0, 0.6)
 _MARGIN = 0.05  # from the ends of a joint's travel [rad]
 _CLEAR = 0.006  # of the table and of the arm itself, more than the guards keep [m]
@@ -40,17 +42,55 @@ def find_work_area(*arms: ArmDescription, tell: Callable[[str], None] = lambda _
     """
     if all(next(_areas(arm, _SCALES[-1]), None) is None for arm in arms):  # before the larger ones, which take long
         raise InvalidValue(
-            f"{arms[0].name}: nowhere on the table before it does the tool point down in an area of "
-            f"{0.4 * _SCALES[-1]:.2f} m. Look at the tool (--site, --gripper) and at the limits of the joints."
+            f"{arms[0].name}: it cannot work in {_size(_SCALES[-1])} on the table before it: {_obstacle(arms)}. "
+            "Look at the tool (--site, --gripper) and at the limits of the joints."
         )
 
     def areas(scale: float, arm: ArmDescription) -> list[ArmDescription]:
         if arm is arms[0]:
-            width, length = 100 * scale * np.diff(BOX[:, :2], axis=0)[0]
-            tell(f"looking for a work area of {width:.0f} x {length:.0f} cm before the arm")
+            tell(f"looking for a work area of {_size(scale)} before the arm")
         return list(_areas(arm, scale))
 
     return next(found[-1] for scale, arm in itertools.product(_SCALES, arms) if (found := areas(scale, arm)))
+
+
+def _size(scale: float) -> str:
+    width, length = 100 * scale * np.diff(BOX[:, :2], axis=0)[0]
+    return f"{width:.0f} x {length:.0f} cm"
+
+
+def _obstacle(arms: Sequence[ArmDescription]) -> str:
+    """What keeps the tool from the smallest work area, where the arms come farthest."""
+    (span, _), height = _span(arms[0].chain), float(arms[0].chain.placements[0, 2, 3])
+    found = [(0.0, f"it reaches {span:.2f} m from its first joint, which is {height:.2f} m above the table")]
+    for arm in arms:
+        chain, outline = arm.chain, Outline(arm.chain)
+        for box in _boxes(chain, _SCALES[-1]):
+            homes = _homes(chain, outline, box)[:4]
+            found += [uncovered(dataclasses.replace(chain, home=home), outline, box) for _, home in homes]
+            found += [] if homes else [_no_home(chain, outline, _middle(box))]
+    return max(found, key=itemgetter(0))[1]
+
+
+def _no_home(chain: SerialChain, outline: Outline, middle: Array) -> tuple[float, str]:
+    """How near the tool comes to pointing down at `middle`, and why it does not."""
+    q, reached = _down(chain, middle)
+    if reached.any():
+        return 0.5, _contact(outline, q[reached])
+    free = dataclasses.replace(chain, low=chain.low - 2 * np.pi, high=chain.high + 2 * np.pi)
+    if not _down(free, middle)[1].any():
+        return 0.0, ""
+    return 0.4, f"limits of joints keep the tool from pointing down at x {middle[0]:.2f}, z {middle[2]:.2f} m"
+
+
+def _contact(outline: Outline, q: Array) -> str:
+    """What an arm touches in most of the postures `q`."""
+    on_table = outline.lowest(q) < _CLEAR - 1e-3
+    if on_table.mean() > 0.5 or not len(outline.pairs):
+        return "the arm would touch the table"
+    pairs = outline.links[outline.pairs[outline.distances(q).argmin(axis=1)]].tolist()
+    one, other = Counter(map(tuple, pairs)).most_common(1)[0][0]
+    return f"links {one} and {other} would touch"
 
 
 def _areas(arm: ArmDescription, scale: float) -> Iterator[ArmDescription]:
@@ -60,7 +100,7 @@ def _areas(arm: ArmDescription, scale: float) -> Iterator[ArmDescription]:
         for margin, home in _homes(chain, outline, box)[:4]:
             if margin <= best:
                 break
-            if covers(dataclasses.replace(chain, home=home), outline, box):
+            if not uncovered(dataclasses.replace(chain, home=home), outline, box)[1]:
                 low, high = (tuple(round(float(one), 4) for one in corner) for corner in box)
                 area: Any = {"home": tuple(map(float, home)), "workspace": (low, high)}
                 yield dataclasses.replace(arm, **area)
@@ -68,12 +108,18 @@ def _areas(arm: ArmDescription, scale: float) -> Iterator[ArmDescription]:
                 break
 
 
+def _span(chain: SerialChain) -> tuple[float, float]:
+    """Longest way from the first joint to the point `up` above the tool that points down, and `up` [m]."""
+    place, out = chain.tool_placement[:3, 3], chain.tool_placement[:3, 2]
+    up = float(place @ out)
+    links = np.linalg.norm(chain.placements[1:, :3, 3], axis=1)
+    return float(links.sum() + np.linalg.norm(place - up * out)), up
+
+
 def _boxes(chain: SerialChain, scale: float) -> Iterator[Array]:
     """Boxes of one size at growing distances from the base."""
-    links = np.linalg.norm(chain.placements[:, :3, 3], axis=1)
-    place, out = chain.tool_placement[:3, 3], chain.tool_placement[:3, 2]
-    length, up = float(links.sum() + np.linalg.norm(place)), float(place @ out)
-    span = links[1:].sum() + np.linalg.norm(place - up * out)  # from the first joint to `up` above the tool, at most
+    (span, up), whole = _span(chain), np.concatenate([chain.placements[:, :3, 3], chain.tool_placement[None, :3, 3]])
+    length = float(np.linalg.norm(whole, axis=1).sum())
     nearest = 0.5 * (BOX[1, 0] - BOX[0, 0]) * scale + 0.08
     for middle, height in itertools.product(np.arange(nearest, length, max(0.02, 0.05 * length)), _HEIGHTS):
         box = BOX * scale
@@ -90,19 +136,15 @@ def _middle(box: Array) -> Array:
 
 def _homes(chain: SerialChain, outline: Outline, box: Array) -> list[tuple[float, Array]]:
     """Poses with the tool down over the middle of `box`, those farthest from limits, table and itself first."""
-    rng = np.random.default_rng(0)
-    low, high = np.maximum(chain.low, -np.pi), np.minimum(chain.high, np.pi)
-    seeds = low + rng.random((_TRIES, chain.num_joints)) * (high - low)
-    wanted = np.tile(_middle(box), (_TRIES, 1))
-    q = _solve(chain, seeds, wanted, np.zeros(_TRIES))
-    clear = np.minimum(outline.lowest(q), outline.nearest(q)) > _CLEAR
-    q = q[clear & _reaches(chain, q, wanted, np.zeros(_TRIES))]
+    q, reached = _down(chain, _middle(box))
+    q = q[(np.minimum(outline.lowest(q), outline.nearest(q)) > _CLEAR) & reached]
     if not len(q):
         return []
     room = np.minimum(q - chain.low, chain.high - q).min(axis=1)
     _, jacobian = chain.jacobians(q)
     least = np.linalg.svd(jacobian[:, : 6 if chain.turns else 5], compute_uv=False)[:, -1]
     gap = np.minimum(np.minimum(outline.nearest(q), outline.lowest(q)), 0.1)
+    low, high = _turns(chain)
     aside = np.sqrt(np.mean((q - 0.5 * (low + high)) ** 2, axis=1))
     scores = np.minimum(room, 1.0) + 4.0 * np.minimum(least, 0.25) + 5.0 * gap - 0.4 * aside
     order = np.argsort(-scores)
@@ -113,16 +155,26 @@ def _homes(chain: SerialChain, outline: Outline, box: Array) -> list[tuple[float
     return picked
 
 
-def _solve(chain: SerialChain, seeds: Array, position: Array, yaw: Array) -> Array:
-    """Inverse kinematics from `seeds` (n, k), which stay near themselves where the tool leaves joints free."""
-    q = seeds
-    for _ in range(40):
-        q = chain.reach_down(position, yaw, q)
-    return q
+def _turns(chain: SerialChain) -> tuple[Array, Array]:
+    """Limits of the joints, within a turn [rad]. Shape: (k,) each."""
+    return np.maximum(chain.low, -np.pi), np.minimum(chain.high, np.pi)
 
 
-def covers(chain: SerialChain, outline: Outline, box: Array) -> bool:
-    """Whether the arm follows straight lines from the middle of `box` to all sides of it, with the gripper turned."""
+def _down(chain: SerialChain, point: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Joints that bring the tool to `point` pointing down, from random postures, and whether each does."""
+    (low, high), wanted = _turns(chain), np.tile(point, (_TRIES, 1))
+    q = low + np.random.default_rng(0).random((_TRIES, chain.num_joints)) * (high - low)
+    for _ in range(40):  # each stays near its posture where the tool leaves joints free
+        q = chain.reach_down(wanted, np.zeros(_TRIES), q)
+    return q, _reaches(chain, q, wanted, np.zeros(_TRIES))
+
+
+def uncovered(chain: SerialChain, outline: Outline, box: Array) -> tuple[float, str]:
+    """Whether the arm follows straight lines from the middle of `box` to all sides of it, with the gripper turned.
+
+    Returns:
+        How far it comes, from 1 to 3, and what keeps it from the rest; "" if nothing does.
+    """
     sides = [np.linspace(low, high, 3) for low, high in box.T]
     points = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
     yaws = np.array([-YAW, 0.0, YAW] if chain.turns else [0.0])
@@ -133,9 +185,18 @@ def covers(chain: SerialChain, outline: Outline, box: Array) -> bool:
         share = step / _STEPS
         wanted = middle + share * (goals - middle)
         q = chain.reach_down(wanted, share * turns, chain.reach_down(wanted, share * turns, q))
-        if (outline.nearest(q) < _CLEAR).any() or (outline.lowest(q) < _CLEAR - 1e-3).any():
-            return False
-    return bool(_reaches(chain, q, goals, turns).all())
+        touching = (outline.nearest(q) < _CLEAR) | (outline.lowest(q) < _CLEAR - 1e-3)
+        if touching.any():
+            return 1.0 + share, _contact(outline, q[touching])
+    lost = ~_reaches(chain, q, goals, turns)
+    if not lost.any():
+        return 3.0, ""
+    x, y, z = goals[lost][0]
+    room = np.minimum(q - chain.low, chain.high - q)[lost]
+    joint = Counter(room.argmin(axis=1).tolist()).most_common(1)[0][0] + 1
+    ends = f": joint {joint} is at the end of its travel" if (room.min(axis=1) <= _MARGIN).mean() > 0.5 else ""
+    turned = f" turned by {YAW} rad" if turns[lost].all() else ""
+    return 3.0 - float(lost.mean()), f"the gripper does not come to x {x:.2f}, y {y:.2f}, z {z:.2f} m{turned}{ends}"
 
 
 def _reaches(chain: SerialChain, q: Array, position: Array, yaw: Array) -> NDArray[np.bool_]:

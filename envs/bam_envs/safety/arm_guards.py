@@ -180,17 +180,16 @@ class JointAcceleration(Guard):
     def limit(self, tick: Tick) -> bool:
         """Bring the step near to the last one."""
         pick, command, last = self._pick, tick.command, self._pick(tick.last)
-        wanted, before = list(map(sub, pick(command), last)), pick(tick.last_step)
-        distances, squared = list(map(abs, map(sub, pick(tick.goal), last))), tick.period**2
-        change, braking = self._brakes * squared, self._brakes * self._period**2
-        shortened, share = tick.period / self._period, 1.0
-        for way, distance, about, most in zip(wanted, distances, before, self.each, strict=True):
-            if abs(way) > most * squared or abs(way) > distance * shortened:
+        goal, before = pick(tick.goal), pick(tick.last_step)
+        squared, shortened, share = tick.period**2, tick.period / self._period, 1.0
+        for now, begin, end, about, most in zip(pick(command), last, goal, before, self.each, strict=True):
+            way, gain = now - begin, most * squared
+            if abs(way) > gain or abs(way) > abs(end - begin) * shortened or not -gain <= way - about <= gain:
                 break  # it may have to brake
-            if not -most * squared <= way - about <= most * squared:
-                break
         else:
             return False
+        wanted, distances = list(map(sub, pick(command), last)), list(map(abs, map(sub, goal, last)))
+        change, braking = self._brakes * squared, self._brakes * self._period**2
         for way, distance in zip(map(abs, wanted), distances, strict=True):
             if way <= change and way <= distance * shortened:  # it can stop after that
                 continue

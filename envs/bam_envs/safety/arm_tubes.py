@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
+from operator import mul, sub
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,8 +68,9 @@ class Tubes:
         self._groups, self._levers = groups, np.array([*[group.levers for group in groups], levers])
         self._in = [{tube for pair in group.pairs for tube in pair[:2]} for group in groups]
         # How far the distances of all groups, and of the lowest point, are above the margin at the joints `_at`, at
-        # least [m]; and what was asked for.
-        self._room, self._at, self._asked = np.zeros(len(self._levers)), np.zeros(len(levers)), (math.nan, math.nan)
+        # least [m], the least of them; and what was asked for.
+        self._room, self._at, self._asked = np.zeros(len(self._levers)), [0.0] * len(levers), (math.nan, math.nan)
+        self._least, self._longest = 0.0, self._levers.max(axis=0).tolist()
         self._posed: tuple[list[float], Any] = [], None
 
     def posture(self, q: Sequence[float]) -> Any:
@@ -98,20 +100,26 @@ class Tubes:
         """Whether two tubes, or the lowest point and the `table`, are nearer than `margin` [m] at the joints `q` (k,).
 
         A distance is computed again only when the joints that change it have turned far enough since the last time to
-        bring it within the margin; see `LinkPair.levers`.
+        bring it within the margin; see `LinkPair.levers`. Since `_at` no distance has changed by more than the turns
+        times the longest levers; where that is less than the least room, no other number is needed.
         """
-        here = np.array(q)
-        lost = self._levers @ np.abs(here - self._at)
+        asked = margin, table
+        if self._asked == asked and sum(map(mul, self._longest, map(abs, map(sub, q, self._at)))) < self._least:
+            return False
+        here = [*q]
+        lost = self._levers @ np.abs(np.subtract(here, self._at))
         self._room -= lost
         self._at = here
-        if self._asked != (margin, table):
-            self._room[:], self._asked = -math.inf, (margin, table)
-        if self._room[self._room.argmin()] > 0.0:
+        if self._asked != asked:
+            self._room[:], self._asked = -math.inf, asked
+        self._least = float(self._room[self._room.argmin()])
+        if self._least > 0.0:
             return False
         for row in np.flatnonzero(~(self._room > _SOON * lost)).tolist():  # of one posture, it costs less
             apart = self._apart(row, margin, q) if row < len(self._groups) else self.lowest(q) - table
             self._room[row] = apart - margin
-        return bool(self._room[self._room.argmin()] < 0.0)
+        self._least = float(self._room[self._room.argmin()])
+        return self._least < 0.0
 
     def _apart(self, row: int, margin: float, q: Sequence[float]) -> float:
         """Distance of two links, at most; of the tubes around them if that is far above the margin [m]."""

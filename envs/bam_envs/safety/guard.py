@@ -413,7 +413,8 @@ def picker(columns: Sequence[int]) -> Callable[[Numbers], Numbers]:
     if columns and list(columns) == list(range(columns[0], columns[-1] + 1)):
         pick: Callable[[Numbers], Numbers] = operator.itemgetter(slice(columns[0], columns[-1] + 1))
         return pick
-    return lambda values: [values[column] for column in columns]
+    some = operator.itemgetter(*columns) if columns else lambda _: ()
+    return lambda values: list(some(values))
 
 
 def is_base(spec: RobotSpec) -> bool:

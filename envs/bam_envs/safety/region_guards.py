@@ -98,7 +98,7 @@ class WorkspaceBox(ForbiddenRegion):
         require_room(self._low, self._high)
         self._tool, size = tool_point_of(tool_position), len(self._joints)
         self._levers = tool_levers(arm_of(tool_position)) or [math.inf] * size
-        self._at, self._room = [0.0] * size, -math.inf  # how far inside the tool is at the joints `_at`, at least [m]
+        self._at, self._room = [0.0] * size, -math.inf  # how far inside the tool is at the joints `_at` [m]
         edges = [most - least for least, most in zip(self._low, self._high, strict=True)]
         self.limit_value = max(edge for edge in edges if edge < math.inf)
 
@@ -114,10 +114,9 @@ class WorkspaceBox(ForbiddenRegion):
 
     def is_outside(self, joints: Sequence[float]) -> bool:
         """As in the base class; computed again only when the joints have turned far enough to bring the tool out."""
-        self._room -= sum(map(mul, self._levers, map(abs, map(sub, joints, self._at))))
-        self._at = [*joints]
-        if not self._room > 0.0:
-            self._room = self._inside(joints)
+        if sum(map(mul, self._levers, map(abs, map(sub, joints, self._at)))) < self._room:
+            return True
+        self._at, self._room = [*joints], self._inside(joints)
         return self._room >= -_TOUCH
 
     def start_fault(self, start: Numbers) -> str | None:

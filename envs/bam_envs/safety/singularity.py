@@ -3,13 +3,14 @@
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from operator import mul, sub
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.arms.serial_chain import Arm, SerialChain
 from bam_envs.core.robot import RobotSpec
-from bam_envs.safety.guard import Guard, Limits, Tick, columns_in
+from bam_envs.safety.guard import Guard, Limits, Tick, columns_in, picker
 
 Array = NDArray[np.float64]
 _SMALLEST, _LARGEST = (2.0, 1.1, 0.5, 1.1), (0.9, 1.2, 1.6, 1.6)
@@ -51,7 +52,7 @@ class Singularity(Guard):
     def __init__(self, spec: RobotSpec, limits: Limits, arm: Arm) -> None:
         self._slow, self.limit_value = limits.singularity_slow, limits.singularity_stop
         self._arm, self._joints = arm, columns_in(spec.command, "rad")
-        size = len(self._joints)
+        self._pick, size = picker(self._joints), len(self._joints)
         if isinstance(arm, SerialChain):
             lengths = np.linalg.norm(arm.placements[1:, :3, 3], axis=1)
             self._unit = max(float(lengths.sum()), 0.1) / 2.0
@@ -60,19 +61,15 @@ class Singularity(Guard):
             self._unit = (abs(arm.a2) + abs(arm.a3)) / 2.0
             self._rates = [least + most / self._slow for least, most in zip(_SMALLEST, _LARGEST, strict=True)]
             self._rates = [0.0, *self._rates, 0.0]
-        self._at: Sequence[float] = [math.inf] * size
-        self._room = 0.0  # smallest singular value minus the largest one divided by `singularity_slow`, at least
+        self._at: Sequence[float] = [0.0] * size
+        self._room = 0.0  # smallest singular value minus the largest one divided by `singularity_slow`, at `_at`
 
     def limit(self, tick: Tick) -> bool:
         """Shorten the step of all joints, except on the way to a start pose, which is not a straight line."""
-        wanted = [tick.command[at] for at in self._joints]
-        for rate, here, there in zip(self._rates, wanted, self._at, strict=True):
-            self._room -= rate * abs(here - there) if rate else 0.0
-        self._at = wanted
-        if self._room > 0.0 or tick.approach:
+        wanted = self._pick(tick.command)
+        if tick.approach or sum(map(mul, self._rates, map(abs, map(sub, wanted, self._at)))) < self._room:
             return False
-        condition = self.condition(wanted)
-        last = [tick.last[at] for at in self._joints]
+        self._at, condition, last = wanted, self.condition(wanted), self._pick(tick.last)
         if condition <= self._slow or condition <= self.condition(last):
             return False
         span = self.limit_value - self._slow

@@ -184,6 +184,14 @@ def test_what_it_refuses(run, monkeypatch, arguments, status, said):
     [
         ([], "which environment? Give its id, such as bam-play bam/reach, or --policy; bam-envs lists them"),
         (["bam/rech"], "Unknown environment 'bam/rech'. Did you mean 'bam/reach-v0'?"),
+        (
+            ["husky"],
+            "husky is a robot; name an environment too, such as bam-play bam/navigation --robot-model husky.",
+        ),
+        (
+            ["so101"],
+            "so101 is a robot; name an environment too, such as bam-play bam/pick --robot-model so101.",
+        ),
         (["bam/reach", "--stage", "full"], "--stage is for a live robot; give its address with --robot too"),
         (
             ["bam/reach", "--set", "max_episode_stesp=3"],

@@ -67,7 +67,7 @@ def test_an_arm_that_does_not_reach_its_work_area_fails_its_check(run, tmp_path)
     path.write_text(text.replace("[0.261, 0.0625, 0.06]", "[0.561, 0.0625, 0.06]"), encoding="utf-8")
     status, out, _ = run(main, "check", path)
     assert status == 1
-    assert "z 0.016 to 0.06 m: not all of it is reached" in out
+    assert "z 0.016 to 0.06 m: not all of it is reached: the gripper does not come to x 0.36" in out
 
 
 NOTHING = "there is no body in it. Is it a part of another file? Then give that one."

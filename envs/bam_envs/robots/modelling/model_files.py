@@ -304,7 +304,7 @@ def _readable(file: str, folder: str) -> str:
 
 def _mesh_file(path: Path, name: str) -> str:
     """The file of a mesh: ``package://NAME/...`` is looked for in the folders above the URDF."""
-    package, rest = re.match(r"(?:package://([^/]+)/|file://)?(.*)", name).groups()  # type: ignore[union-attr]
+    package, rest = re.match(r"(?:package:///?([^/]+)/|file://)?(.*)", name).groups()  # type: ignore[union-attr]
     tails = [rest] if package is None else [rest, f"{package}/{rest}"]
     for folder in path.resolve().parents:
         for tail in tails:
@@ -339,7 +339,8 @@ def _named_body(spec: Any, site: str | None, model: str, gripper: str | None) ->
 def _last_body(spec: Any, gripper: str | None) -> Any:
     """The body at the end of the one chain of revolute joints, before its fingers; None if unclear.
 
-    Without a `gripper`, a last joint to which nothing else is fixed is its jaw, or frames alone if it is called so.
+    A last joint to which nothing but frames is fixed is its jaw if it is called so; without a `gripper` also one that
+    nothing at all is fixed to, or that turns a body that is called so.
     """
     hinge, joints, body = mujoco.mjtJoint.mjJNT_HINGE, 0, spec.worldbody
     while True:
@@ -353,9 +354,9 @@ def _last_body(spec: Any, gripper: str | None) -> Any:
     while joints and not jaw.joints and not jaw.geoms:
         jaw = jaw.parent
     frames = jaw.find_all("body")
-    named = any(_JAW.search(one.name) for one in (jaw, *jaw.joints))
-    last = not frames or (named and not any(one.joints or one.geoms for one in frames))
-    if gripper is None and joints and jaw.joints and last:
+    named = any(_JAW.search(one.name) for one in (*jaw.joints, *([jaw] if gripper is None else [])))
+    last = (gripper is None and not frames) or (named and not any(one.joints or one.geoms for one in frames))
+    if joints and jaw.joints and last:
         body, joints = jaw.parent, joints - 1
     return body if joints >= _FEWEST_JOINTS and body.name else None
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bam_envs.arms.capsules import Outline
-from bam_envs.arms.work_area import covers
+from bam_envs.arms.work_area import uncovered
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.robot_models import read_description
 from bam_envs.robots.modelling.describe import as_toml, describe, joint_rows
@@ -162,14 +162,17 @@ def test_the_end_of_the_one_chain_is_taken_where_no_name_tells_it(tmp_path):
     assert "the end of the arm is link7" in read_arm(str(tmp_path / "hand.xml"), GRIPPER, None).notes[0]
 
 
-@pytest.mark.parametrize(("jaw", "end"), [("jaw", "b5"), ("turn", "tip")])
-def test_a_last_joint_that_frames_follow_is_a_jaw_if_it_is_called_so(tmp_path, jaw, end):
+@pytest.mark.parametrize(
+    ("jaw", "gripper", "end", "joints"),
+    [("jaw", None, "b5", 5), ("jaw", "parallel:0.08", "b5", 5), ("turn", "parallel:0.08", "tip", 6)],
+)
+def test_a_last_joint_that_frames_follow_is_a_jaw_if_it_is_called_so(tmp_path, jaw, gripper, end, joints):
     text = FIVE.replace("</body>", '<body name="tip"/></body>', 1).replace("</body>", '<body name="palm"/></body>', 2)
     text = text.replace('<body name="palm"/></body>', "</body>", 1).replace('"jaw"', f'"{jaw}"')
     (tmp_path / "lab.xml").write_text(text, encoding="utf-8")
-    read = read_arm(str(tmp_path / "lab.xml"), None if end == "b5" else GRIPPER, None)
+    read = read_arm(str(tmp_path / "lab.xml"), gripper, None)
     assert read.notes[0].startswith(f"the end of the arm is {end}, ")
-    assert len(read.names) == (5 if end == "b5" else 6)
+    assert len(read.names) == joints
 
 
 def test_nothing_is_known_of_a_gripper_that_has_no_shapes_so_its_capsules_count_in_full(described):
@@ -225,7 +228,7 @@ def test_it_is_read_as_it_was_written(described, name, tmp_path):
 def test_the_whole_work_area_is_reached(described, name):
     arm, _ = described[name]
     box = np.array(arm.workspace)
-    assert covers(arm.chain, Outline(arm.chain), box)
+    assert uncovered(arm.chain, Outline(arm.chain), box) == (3.0, "")
     assert box[0, 2] == 0.016
     assert (box[1] - box[0] >= [0.1, 0.12, 0.04]).all()
 
@@ -583,7 +586,10 @@ def test_an_arm_that_faces_another_way_is_turned_to_face_x(described, tmp_path):
     )
 
 
-@pytest.mark.parametrize("name", ["package://lab_description/meshes/w.obj", "meshes/w.obj"])
+@pytest.mark.parametrize(
+    "name",
+    ["package://lab_description/meshes/w.obj", "package:///lab_description/meshes/w.obj", "meshes/w.obj"],
+)
 def test_a_mesh_that_is_beside_the_file_is_found(tmp_path, name):
     """Also where the ROS package is not installed."""
     path = tmp_path / "lab_description" / "urdf" / "lab.urdf"
