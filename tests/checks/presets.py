@@ -41,11 +41,11 @@ ZOO = {
 HEADER = ("preset", "learnt", "score", "least", "rl-zoo3", "steps", "CPU time", "made")
 HEAD = """# Presets measured
 
-Runs of `bam-train` with a preset and nothing else, each with a seed of its own. Learnt is, over 500 fresh episodes, a
-success of 90 %, or the environment's threshold. The score is the success, or the mean return where there is none: the
-interquartile mean over seeds with its 95 % interval, as [`bam-compare`](compare.md) has it, and the least of all seeds.
-rl-zoo3 is what one agent of that algorithm has there. Steps are those of the checkpoint, CPU time is that of the whole
-program: medians, least and most. Written by `python -m tests.checks presets`.
+Runs of `bam-train` with a preset alone, a seed each. Learnt is 90 % success in 500 fresh episodes, or the environment's
+threshold. The score is the success, or the mean return where there is none: its interquartile mean over seeds with its
+95 % interval, as in [`bam-compare`](compare.md), and the least one. rl-zoo3 is the return of an agent there. Steps of
+the checkpoint and CPU time of the program are medians, with least and most. Written by `python -m tests.checks
+presets`.
 
 """
 
