@@ -36,6 +36,7 @@ ZOO = {
     "CartPole-v1-ppo": 500.0,
     "MountainCarContinuous-v0-ppo": 88.3,
     "Pendulum-v1-ppo": -172.2,
+    "Pendulum-v1-sac": -157.0,
 }
 """Preset to the mean return of the same algorithm on the benchmark page of rl-baselines3-zoo, of one agent."""
 HEADER = ("preset", "learnt", "score", "least", "rl-zoo3", "steps", "CPU time", "made")
