@@ -42,10 +42,9 @@ ZOO = {
 HEADER = ("preset", "learnt", "score", "least", "rl-zoo3", "steps", "CPU time", "made")
 HEAD = """# Presets measured
 
-Runs of `bam-train` with a preset alone, a seed each. Learnt is 90 % success in 500 fresh episodes, or the environment's
-threshold. The score is the success, or the mean return where there is none: its interquartile mean over seeds with its
-95 % interval, as in [`bam-compare`](compare.md), and the least one. rl-zoo3 is the return of an agent there. Steps of
-the checkpoint and CPU time of the program are medians, with least and most. Written by `python -m tests.checks
+`bam-train` with a preset alone. Learnt is 90 % success in 500 fresh episodes, or the environment's threshold. The score
+is the success or else the mean return, over seeds as [`bam-compare`](compare.md) has it, and the least one; rl-zoo3 has
+one agent's. Steps of the checkpoint and CPU time are medians, with least and most. Written by `python -m tests.checks
 presets`.
 
 """
