@@ -27,7 +27,7 @@ ENV, NAME = "bam/mir100-navigation-v0", Path(__file__).stem
 class Flags(TrainingFlags):
     """How long it trains, and how often the policy is run."""
 
-    steps: Count = 15_000
+    steps: Count = 40_000
     """Steps of training."""
     episodes: Count = 10
     """Episodes afterwards."""

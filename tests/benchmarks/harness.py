@@ -28,6 +28,8 @@ from bam_envs.core.wording import did_you_mean
 from bam_train.cli.flags import Positive
 from bam_train.cli.program import guarded, parse
 from bam_train.errors import SettingsError
+from bam_train.files.atomic_file import replacing
+from bam_train.trainers.base import origin
 
 ROOT = Path(__file__).parents[2]
 CHECKPOINTS = ROOT / "checkpoints"
@@ -75,6 +77,14 @@ def number(value):
 def table_row(*cells):
     """A line of a table in Markdown."""
     return f"| {' | '.join(cells)} |"
+
+
+def write_table(page, head, header, rows):
+    """Write a page of Markdown with a table, and the computer and versions that its newest rows are of."""
+    versions = ", ".join(f"{name} {version}" for name, version in origin()["versions"].items())
+    table = "\n".join([table_row(*header), table_row(*["---"] * len(header)), *rows])
+    with replacing(page) as path:
+        path.write_text(f"{head}{table}\n\nThe newest rows: {os.cpu_count()} CPU cores, {versions}.\n")
 
 
 def at_most(what, value, goal, unit="", found=None):

@@ -13,7 +13,6 @@ Examples:
   python -m tests.checks commands --only td3 --seeds 5 --folder /tmp/td3 --log /tmp/td3.md
 """
 
-import os
 import re
 import resource
 import shlex
@@ -31,10 +30,9 @@ from tyro.conf import arg
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.flags import Count, Seed
 from bam_train.evaluation import evaluate
-from bam_train.files.atomic_file import replacing
 from bam_train.policy import FrozenPolicy
 from bam_train.trainers.base import origin
-from tests.benchmarks.harness import CHECKPOINTS, ROOT, table_row
+from tests.benchmarks.harness import CHECKPOINTS, ROOT, table_row, write_table
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 LOG = CHECKPOINTS / "commands.md"
@@ -155,11 +153,7 @@ def write_log(log: Path, rows: dict[tuple[str, str], str]) -> None:
     """Write a log: rows of commands that the pages have, in their order, and the computer that they were run on."""
     known = [shlex.join(words) for words in commands()]
     kept = sorted((key for key in rows if key[0] in known), key=lambda key: (known.index(key[0]), int(key[1])))
-    versions = ", ".join(f"{name} {version}" for name, version in origin()["versions"].items())
-    foot = f"\nThe newest rows: {os.cpu_count()} CPU cores, {versions}.\n"
-    table = [table_row(*HEADER), table_row(*["---"] * len(HEADER)), *(rows[key] for key in kept)]
-    with replacing(log) as path:
-        path.write_text(HEAD + "\n".join(table) + "\n" + foot)
+    write_table(log, HEAD, HEADER, [rows[key] for key in kept])
 
 
 @dataclass(frozen=True)

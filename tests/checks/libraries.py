@@ -37,10 +37,9 @@ from bam_train.cli.flags import Seed
 from bam_train.environments import make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.evaluation import FIRST_SEED, evaluate
-from bam_train.files.atomic_file import replacing
 from bam_train.trainers.base import origin
 from bam_train.trainers.resolve_settings import read_preset
-from tests.benchmarks.harness import ROOT, program, table_row
+from tests.benchmarks.harness import ROOT, program, table_row, write_table
 from tests.checks.commands import LEARNT_NOTHING
 
 PAGE = ROOT / "docs" / "benchmarks.md"
@@ -362,9 +361,5 @@ def main(args: Flags) -> int:
 
 
 def write(page: Path, rows: dict[tuple[str, str], str]) -> None:
-    """Write the page, with the computer that the newest rows are of."""
-    kept = [rows[key] for key in itertools.product(LEVELS, LIBRARIES) if key in rows]
-    versions = ", ".join(f"{name} {version}" for name, version in origin()["versions"].items())
-    table = [table_row(*HEADER), table_row(*["---"] * len(HEADER)), *kept]
-    with replacing(page) as path:
-        path.write_text(f"{HEAD}{chr(10).join(table)}\n\nThe newest rows: {os.cpu_count()} CPU cores, {versions}.\n")
+    """Write the page."""
+    write_table(page, HEAD, HEADER, [rows[key] for key in itertools.product(LEVELS, LIBRARIES) if key in rows])

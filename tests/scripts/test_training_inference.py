@@ -145,10 +145,10 @@ def test_td3_trains_saves_and_runs_and_overwrites_nothing(run_here, tmp_path):
     (tmp_path / "checkpoints").mkdir()
     taken = tmp_path / "checkpoints" / "mir100-navigation-td3.zip"
     taken.write_text("somebody's")
-    done = run_here("td3_mir", "--steps", 4, "--episodes", 1, "--seed", 3, folder=tmp_path)
+    done = run_here("td3_mir", "--steps", 64, "--episodes", 1, "--seed", 3, folder=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
     assert lines[0] == "saving to checkpoints/mir100-navigation-td3-2.zip twenty times"
-    assert lines[-2].startswith("        4 steps, mean total reward ")
+    assert lines[-2].startswith("       64 steps, mean total reward ")
     assert re.fullmatch(r"episode 1: total reward -?\d+\.\d\d(, success)?", lines[-1])
     assert taken.read_text() == "somebody's"
