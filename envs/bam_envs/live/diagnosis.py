@@ -19,7 +19,6 @@ from bam_envs.live import bringup
 from bam_envs.live.building import live_robot, require_robot_address
 from bam_envs.live.examination import PING_TOPIC, Array, Inspection, Reading, inspect_robot
 from bam_envs.robots.profile import load_profile, own_profile, profile_for, shipped_profiles
-from bam_envs.ros.codec import INFO_SERVICE, read_info
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.bus import namespaces_with
 from bam_envs.rosbridge.client import RosbridgeLink
@@ -134,11 +133,9 @@ class Diagnosis:
 
     def _rosbridge(self) -> Findings:
         self._link.connect()
-        service, ros = self._link.namespace + INFO_SERVICE, self._link.ros
+        ros, info = self._link.ros, bringup.robot_info(self._link)
         found = ["answers" + ("" if ros is None else f" as ROS {ros[-1]}")]
-        answer = bringup.ask(self._link, service)
-        if answer is not None:
-            info = read_info(answer.get("message"), service)
+        if info is not None:
             found.append(f"the robot describes itself: {info.text or info.name}")
             if self.profile is None and own_profile(info.name) is not None:
                 self.profile = load_profile(info.name)
