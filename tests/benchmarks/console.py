@@ -94,8 +94,10 @@ def put_first(process):
 
 @contextlib.contextmanager
 def busy(count):
-    """So many programs that compute, while the block runs."""
-    programs = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    """So many programs that compute, each in a session of its own, while the block runs."""
+    programs = [
+        subprocess.Popen([sys.executable, "-c", "while True: pass"], start_new_session=True) for _ in range(count)
+    ]
     try:
         yield
     finally:

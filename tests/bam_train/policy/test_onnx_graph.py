@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
 from bam_train.errors import FormatError, PolicyError
-from bam_train.policy import FrozenPolicy
+from bam_train.policy import FrozenPolicy, onnx_session
 from bam_train.policy.onnx_graph import MOST_NODES, require_policy
 from bam_train.policy.onnx_session import OnnxSession
 
@@ -156,9 +156,9 @@ def test_memory_that_no_policy_takes_is_refused():
         FrozenPolicy.from_graph(of(*GROWING, axes=np.array([2, 3]), **shape), BOX, BOX)
 
 
-def slow() -> bytes:
+def slow(products: int = 100) -> bytes:
     """Take several seconds: products of matrices of 1000 x 1000 numbers that depend on the observation."""
-    names = ["wide", *(f"h{i}" for i in range(100))]
+    names = ["wide", *(f"h{i}" for i in range(products))]
     return of(
         node("Softsign", ["observation"], ["soft"]),
         node("ReduceSum", ["soft"], ["sum"], keepdims=0),
@@ -175,6 +175,15 @@ def test_a_policy_that_takes_too_long_is_stopped():
     session.most_seconds = 0.5
     with pytest.raises(PolicyError, match=r"the policy takes more than 0\.5 s for one action"):
         session.run({"observation": np.zeros((1, 4), np.float32)}, ["action"])
+
+
+def test_a_policy_that_waits_for_a_busy_computer_is_not_stopped(monkeypatch: pytest.MonkeyPatch):
+    session = OnnxSession(slow(10))
+    session.most_seconds = 0.01
+    monkeypatch.setattr(onnx_session, "_PATIENCE", 1e6)
+    monkeypatch.setattr(onnx_session.time, "process_time", lambda: 0.0)  # as if others had the CPU
+    [action] = session.run({"observation": np.zeros((1, 4), np.float32)}, ["action"])
+    assert action.tolist() == [[0.0] * 4]
 
 
 def test_a_policy_that_takes_long_is_interrupted_by_ctrl_c():
