@@ -340,7 +340,7 @@ def _why_old(reading: Reading, limit: float, inspection: Inspection, *, here: bo
         return f"But {inspection.busy}, and the robot may be in time: close other programs, and measure again."
     if reading.delays[-1] - reading.delays[0] > (reading.arrived[-1] - reading.arrived[0]) / 2:
         return "Their stamp stands still: the driver repeats an old measurement. Start it again."
-    if rarely:
+    if late <= limit and rarely:
         return "They come too rarely: raise the rate of their driver."
     if late <= limit:
         return "They come in bursts, with pauses between: the network, or a busy computer on the way, holds them back."
