@@ -7,12 +7,14 @@ share their servers. The longest come first, so that the workers end at about th
 
 import contextlib
 import gc
+import json
 import os
 import signal
 import sys
 import time
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -151,3 +153,46 @@ def stack():
     """Closes what a test has made, the newest first."""
     with contextlib.ExitStack() as stack:
         yield stack
+
+
+@pytest.fixture
+def chunk_checkpoint(tmp_path):
+    """Makes a checkpoint.zip for an SO-101 whose chunks keep every joint but wrist_roll, which turns by 0.1 deg a step.
+
+    The arguments are those of `Chunk`, and actions in a second.
+    """
+
+    def make(name="act.zip", rate=20.0, **chunk):
+        from onnx import TensorProto, helper, numpy_helper
+
+        from bam_train.compat.foreign_export import export_foreign
+        from bam_train.compat.foreign_policy import described_policy
+
+        size, names = chunk["size"], ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]
+        ramp = np.zeros((size, 6), np.float32)
+        ramp[:, 4] = np.arange(size) * 0.1
+        weights = {"ramp": ramp, "shape": np.array([-1, size, 6])}
+        nodes = [
+            helper.make_node("Concat", ["state"] * size, ["row"], axis=1),
+            helper.make_node("Reshape", ["row", "shape"], ["seen"]),
+            helper.make_node("Add", ["seen", "ramp"], ["actions"]),
+        ]
+        infos = [
+            helper.make_tensor_value_info(one, TensorProto.FLOAT, shape)
+            for one, shape in (("state", ["n", 6]), ("actions", ["n", size, 6]))
+        ]
+        graph = helper.make_graph(
+            nodes, "policy", infos[:1], infos[1:], [numpy_helper.from_array(v, k) for k, v in weights.items()]
+        )
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+        (tmp_path / "act.onnx").write_bytes(model.SerializeToString())
+        table = ", ".join(f"{key} = {json.dumps(value)}" for key, value in chunk.items())
+        ports = f'names = {json.dumps([*names, "gripper"])}\nunits = "degrees"\n'
+        (tmp_path / "act.toml").write_text(
+            f'network = "act.onnx"\nrate = {rate}\nchunk = {{ {table} }}\n'
+            f'[[inputs]]\nname = "state"\n{ports}[output]\nname = "actions"\n{ports}'
+        )
+        policy = described_policy(tmp_path / "act.toml")
+        return export_foreign(policy, "bam/joints-v0", {"robot_model": "so101"}).write(tmp_path / name).path
+
+    return make

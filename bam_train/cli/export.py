@@ -22,6 +22,7 @@ JOINTS = "bam/joints"
 def export_policy(config: ExportConfig) -> None:
     """Run the program with its parsed flags."""
     from bam_train.errors import SettingsError
+    from bam_train.trainers.best_checkpoint import FOLDER, require_output
 
     kind, path = _kind(config.source)
     meant = {"rllib": ("policy",), "lerobot": ("data", "units"), "sb3": ("statistics",)}
@@ -29,6 +30,7 @@ def export_policy(config: ExportConfig) -> None:
         for name in names:
             if kind != other and getattr(config, name) is not None:
                 raise SettingsError(f"--{name} is for {other}, and {config.source} is read as {kind}; leave it out")
+    require_output(config.out or FOLDER / "policy.zip")  # not after the work
     make = {"rllib": _directory, "sb3": _zip}.get(kind, partial(_network, kind=kind))
     _write(config, make(config, path=path))
 

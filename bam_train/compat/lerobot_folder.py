@@ -128,10 +128,12 @@ class _Network(Layer):
         super().__init__()
         try:
             module = import_module(f"lerobot.policies.{kind}.modeling_{kind}")
+            config = import_module("lerobot.configs.policies").PreTrainedConfig.from_pretrained(folder)
         except ImportError as error:
             text = f"{folder}: LeRobot makes the network, and {error.name or 'lerobot'} is not installed"
             raise SettingsError(f'{text}. Run: pip install "lerobot"') from error
-        policy = getattr(module, KINDS[kind]).from_pretrained(folder)
+        config.pretrained_backbone_weights = None  # else they are downloaded, and then replaced by the policy's own
+        policy = getattr(module, KINDS[kind]).from_pretrained(folder, config=config)
         config, self.version = policy.config, version("lerobot")
         self.images, self.shape = list(config.image_features), tuple(config.action_feature.shape)
         features = {**config.image_features}

@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from bam_envs.ros.codec import A_POLICY
 from bam_train.policy.frozen_policy import FrozenPolicy
 
 Array = NDArray[Any]
@@ -26,7 +27,7 @@ class ServedPolicy(gym.Env[Array, dict[str, Array]]):
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as Gymnasium has it
-    served_as = "a policy"
+    served_as = A_POLICY
     """What a server says that it serves."""
 
     def __init__(self, policy: FrozenPolicy) -> None:

@@ -41,13 +41,7 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
     earlier = None if resumed is None else _earlier_best(resumed)
     usual = FOLDER / f"{file_stem(settings.env, settings.algo, settings.trainer, settings.env_kwargs)}.zip"
     wanted = (out or (earlier.path if earlier else usual)).expanduser()
-    if wanted.is_dir():
-        raise OutputError(
-            f"{wanted}: is a folder; give the name of a file in it, such as --out {wanted / 'policy.zip'}"
-        )
-    if wanted.suffix != ".zip":
-        raise OutputError(f"{wanted}: expected a file name that ends in .zip. Choose another one with --out")
-    require_room(wanted, "--out", wanted.parent)
+    require_output(wanted)
     remove_orphans(wanted.resolve())
     if earlier is not None and wanted.resolve() == earlier.path:
         return Output(wanted, earlier.best)
@@ -56,6 +50,16 @@ def choose_output(settings: TrainSettings, out: Path | None, force: bool, resume
     numbered = (wanted.with_name(f"{wanted.stem}-{number}.zip") for number in itertools.count(2))
     free = next(path for path in numbered if not os.path.lexists(path))
     return Output(free, None, (f"{wanted} exists: the checkpoint goes to {free} (--force overwrites)",))
+
+
+def require_output(path: Path) -> None:
+    """Raise OutputError unless a checkpoint can be written to `path`."""
+    path = path.expanduser()
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder; give the name of a file in it, such as --out {path / 'policy.zip'}")
+    if path.suffix != ".zip":
+        raise OutputError(f"{path}: expected a file name that ends in .zip. Choose another one with --out")
+    require_room(path, "--out", path.parent)
 
 
 class _Noted(Struct):

@@ -20,8 +20,6 @@ from bam_train.checkpoint import GOLDEN, MANIFEST, POLICY, safetensors_file, wri
 from bam_train.cli.flags import TrainConfig
 from bam_train.cli.program import guarded
 from bam_train.cli.train import train
-from bam_train.compat.foreign_export import export_foreign
-from bam_train.compat.foreign_policy import described_policy
 from tests.one_ray import no_ray_fixture, one_ray_fixture, shared_ray_fixture  # noqa: F401
 
 
@@ -105,46 +103,6 @@ def served():
             yield one.bus.url, one.tcp.url
 
     return serve
-
-
-@pytest.fixture
-def chunk_checkpoint(tmp_path):
-    """Makes a checkpoint.zip for an SO-101 whose chunks keep every joint but wrist_roll, which turns by 0.1 deg a step.
-
-    The arguments are those of `Chunk`, and actions in a second.
-    """
-
-    def make(name="act.zip", rate=20.0, **chunk):
-        from onnx import TensorProto, helper, numpy_helper
-
-        size, names = chunk["size"], ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]
-        ramp = np.zeros((size, 6), np.float32)
-        ramp[:, 4] = np.arange(size) * 0.1
-        weights = {"ramp": ramp, "shape": np.array([-1, size, 6])}
-        nodes = [
-            helper.make_node("Concat", ["state"] * size, ["row"], axis=1),
-            helper.make_node("Reshape", ["row", "shape"], ["seen"]),
-            helper.make_node("Add", ["seen", "ramp"], ["actions"]),
-        ]
-        infos = [
-            helper.make_tensor_value_info(one, TensorProto.FLOAT, shape)
-            for one, shape in (("state", ["n", 6]), ("actions", ["n", size, 6]))
-        ]
-        graph = helper.make_graph(
-            nodes, "policy", infos[:1], infos[1:], [numpy_helper.from_array(v, k) for k, v in weights.items()]
-        )
-        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-        (tmp_path / "act.onnx").write_bytes(model.SerializeToString())
-        table = ", ".join(f"{key} = {json.dumps(value)}" for key, value in chunk.items())
-        ports = f'names = {json.dumps([*names, "gripper"])}\nunits = "degrees"\n'
-        (tmp_path / "act.toml").write_text(
-            f'network = "act.onnx"\nrate = {rate}\nchunk = {{ {table} }}\n'
-            f'[[inputs]]\nname = "state"\n{ports}[output]\nname = "actions"\n{ports}'
-        )
-        policy = described_policy(tmp_path / "act.toml")
-        return export_foreign(policy, "bam/joints-v0", {"robot_model": "so101"}).write(tmp_path / name).path
-
-    return make
 
 
 class Spoilt(gym.Env):

@@ -1,4 +1,4 @@
-"""A deployment: guards, one tick without the network, the recorder, and 100 Hz over loopback.
+"""A deployment: guards, one tick without the network, the recorder, 100 Hz over loopback, and chunks beside the ticks.
 
 Except at 100 Hz, the robot is a simulated one in this process, which follows its commands exactly, behind the guards of
 a live robot; its time advances with commands.
@@ -6,6 +6,7 @@ a live robot; its time advances with commands.
 
 import contextlib
 import tempfile
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,8 +26,10 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.flight import FlightLog, flight_recorder
 from bam_train.deploy.journal import Journal
+from bam_train.environments import environment_of, make_env
 from bam_train.errors import SettingsError
 from bam_train.policy import FrozenPolicy
+from bam_train.policy.background import Background
 from tests.benchmarks import harness
 from tests.benchmarks.harness import HOME, Peer, at_most, percentiles
 from tests.benchmarks.link import live_arm, serve_robot
@@ -40,6 +43,8 @@ class Flags(harness.Flags):
     """Count this thread's processor time in microseconds; for a busy machine."""
     robot: str | None = None
     """A UR5e for the row at 100 Hz instead of the embedded server's, such as ws://10.0.0.5:9090."""
+    chunks: Path | None = None
+    """A checkpoint of bam/joints with chunks, such as an ACT that bam-export took, for the rows of chunks."""
 
 
 class TimedLink(LinkedRobot):
@@ -179,3 +184,51 @@ def measure_rate(flags):
     yield percentiles("  late by", late, "ms")
     yield percentiles("  age of states", ages, "ms")
     yield at_most("  ticks lost", int((np.array(late) > 0.01).sum()), 0)
+
+
+def measure_chunks(flags):
+    """Ten minutes at 30 Hz beside the computation of chunks, with observations that stay for half a second.
+
+    Whether a tick is late because of a chunk is told by those of a loop in the same run that computes none; smoothness,
+    by chunks that come at once.
+    """
+    if flags.chunks is None:
+        yield "chunks: --chunks act.zip measures a policy with chunks"
+        return
+    checkpoint = Checkpoint.open(flags.chunks)
+    policy, period = FrozenPolicy.from_checkpoint(checkpoint), checkpoint.manifest.period
+    with contextlib.closing(make_env(*environment_of(checkpoint, None))) as env:
+        fade = env.unwrapped.task.action_step
+        env.observation_space.seed(0)
+        seen = [env.observation_space.sample() for _ in range(8)]
+    count, hold = flags.times(18_000), round(0.5 / period)
+    alone, late, acting, actions = [], {True: [], False: []}, [], []
+    for _ in range(2):  # before and after
+        pacer = Pacer(period)
+        pacer.start()
+        alone += [pacer.wait() for _ in range(count // 10)]
+        if actions:
+            break
+        with contextlib.closing(Background(policy, period, fade=fade)) as beside:
+            beside.prepare(seen[0])
+            pacer.start()
+            for k in range(count):
+                computes = any(one.name == "bam-chunk" for one in threading.enumerate())
+                late[computes].append(pacer.wait())
+                begun = clock()
+                actions.append(beside.act(seen[k // hold % len(seen)]))
+                acting.append(clock() - begun)
+    plan, at_once = policy.plan(fade), []
+    for k in range(count):
+        plan.see(policy.checked(seen[k // hold % len(seen)]))
+        if plan.is_due(1):
+            plan.add(plan.step, policy.answer({name: one[None] for name, one in plan.seen().items()})[0], plan.tick)
+        at_once.append(plan.take())
+    shares = [100 * float((np.array(one) > period / 10).mean()) for one in (late[True], [*late[False], *alone])]
+    found = f"{shares[0]:.2f} %; without one {shares[1]:.2f} %"
+    yield at_most("ticks late by a tenth of a period beside a chunk", shares[0], shares[1] + 1, "%", found)
+    yield percentiles("  the loop's own part of a chunk", acting, "ms")
+    jerks = [float(np.sqrt(np.mean(np.diff(one, 3, axis=0) ** 2))) for one in (actions, at_once)]
+    yield at_most("rms jerk, of the same with chunks at once", jerks[0] / max(jerks[1], 1e-12), 1.2)
+    steps = [float((np.abs(np.diff(one, axis=0)) / fade).max()) for one in (actions, at_once)]
+    yield at_most("  longest step, of the task's largest", steps[0], max(1.0, steps[1]))

@@ -122,9 +122,9 @@ def test_smoothness(bench):
 
 def test_console(bench):
     require_browser()
-    *rows, text = bench("console", "--cameras", 2, "--rate", 5)
-    names = ["stop button to halt, 2 cameras at 5 Hz", "  of which after the press in the page"]
-    assert [row[0] for row in rows] == names
+    *rows, text = bench("console", "--cameras", 2, "--rate", 5, "--busy", 1)
+    hops = "  until the press in the page", "  from there to the robot", "  and to the front process and back"
+    assert [row[0] for row in rows] == ["stop button to halt, 2 cameras at 5 Hz", *hops]
     assert all(re.fullmatch(r"p50 [\d.]+, p99 [\d.e+]+ ms", row[1]) for row in rows)
     drawn = re.fullmatch(r"  2 presses, at most [\d.]+ ms; ([\d.]+) images drawn a second", text[0])
     assert 0.0 < float(drawn[1]) <= 6.0
@@ -156,6 +156,17 @@ def test_deployment(bench):
         "100 Hz, embedded server, ticks late by > 1 ms",
     )
     assert all(found[name] in ("met", "MISSED") for name in rows)
+
+
+def test_chunks(bench, chunk_checkpoint):
+    rows = bench("deploy", "--only", "chunks", "--chunks", chunk_checkpoint(size=20, steps=10, rate=100.0))
+    assert [row[0] for row in rows] == [
+        "ticks late by a tenth of a period beside a chunk",
+        "  the loop's own part of a chunk",
+        "rms jerk, of the same with chunks at once",
+        "  longest step, of the task's largest",
+    ]
+    assert bench("deploy", "--only", "chunks") == [["chunks: --chunks act.zip measures a policy with chunks"]]
 
 
 def test_loop(bench, monkeypatch):

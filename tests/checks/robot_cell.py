@@ -191,7 +191,7 @@ def _await(ready: Sequence[Any]) -> None:
         raise RuntimeError(f"A process of the robot cell did not start within {_START:g} s.")
 
 
-def _be_another_computer() -> None:
+def be_another_computer() -> None:
     """Let this process run before others where that is allowed, and log nothing here."""
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, 0, -15)
@@ -203,7 +203,7 @@ def _be_another_computer() -> None:
 
 def run_robot(env_id: str, wire: socket.socket, path: Path, ready: Any) -> None:
     """Main function of the robot's process: it receives method calls and sends states on `wire`, and writes its log."""
-    _be_another_computer()
+    be_another_computer()
     env: Any = gym.make(env_id, disable_env_checker=True).unwrapped
     profile = profile_for(env.robot.spec)
     rests_at_zero = any(sink.hold == "zero" for mode in profile.commands.values() for sink in mode)
@@ -336,7 +336,7 @@ def run_driver(
     spec: RobotSpec, wire: socket.socket, port: Any, fault: Any, describes_itself: bool, bridge: Any, ready: Any
 ) -> None:
     """Main function of the driver's process: offers the robot on the server at `port` once `bridge` is set."""
-    _be_another_computer()
+    be_another_computer()
     profile = profile_for(spec)
     bridge.wait(_START)
     link = RosbridgeLink(f"ws://127.0.0.1:{port.value}", name="driver")
@@ -350,7 +350,7 @@ def run_driver(
 
 def run_bridge(port: Any, ready: Any) -> None:
     """Main function of the bridge's process; it listens on `port`, which it sets if it is 0."""
-    _be_another_computer()
+    be_another_computer()
     port.value = BridgeServer(port=port.value).start().port
     ready.set()
     threading.Event().wait()

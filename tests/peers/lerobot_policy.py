@@ -42,11 +42,17 @@ if kind == "act":
     policy, (pre, post) = ACTPolicy(config).eval(), make_act_pre_post_processors(config, stats)
 else:
     own = {"horizon": 8, "n_action_steps": 5, "noise_scheduler_type": "DDIM", "num_inference_steps": 4}
-    config = DiffusionConfig(down_dims=(16, 32, 64), crop_shape=(40, 56), **both, **own)
+    config = DiffusionConfig(
+        down_dims=(16, 32, 64), crop_shape=(40, 56), pretrained_backbone_weights=None, **both, **own
+    )
     policy, (pre, post) = DiffusionPolicy(config).eval(), make_diffusion_pre_post_processors(config, stats)
 noise = torch.randn(1, 8, 6, generator=torch.Generator().manual_seed(0))
 for part in (policy, pre, post):
     part.save_pretrained(folder / "pretrained_model")
+saved = folder / "pretrained_model" / "config.json"
+if kind == "act":  # as LeRobot's default, which would be downloaded
+    weights = {"pretrained_backbone_weights": "ResNet18_Weights.IMAGENET1K_V1"}
+    saved.write_text(json.dumps(json.loads(saved.read_text()) | weights))
 (folder / "data" / "meta").mkdir(parents=True)
 features = {name: {"names": NAMES} for name in (state, "action")}
 (folder / "data" / "meta" / "info.json").write_text(json.dumps({"fps": 20, "features": features}))

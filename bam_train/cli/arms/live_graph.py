@@ -12,11 +12,10 @@ from typing import Any
 from bam_envs.arms.description import ArmDescription
 from bam_envs.core.errors import InvalidValue, LinkLost, RemoteError
 from bam_envs.core.wording import listed
-from bam_envs.live.bringup import TIMEOUT, ask
+from bam_envs.live.bringup import TIMEOUT, robot_info
 from bam_envs.live.examination import DESCRIPTION
 from bam_envs.live.state import Letter, Mailbox
 from bam_envs.robots.profile import load_profile, shipped_profiles
-from bam_envs.ros.codec import INFO_SERVICE, read_info
 from bam_envs.ros.messages import bare_type
 from bam_envs.ros.profile_tables import RobotProfile, Sink, Source
 from bam_envs.rosbridge.client import RosbridgeLink
@@ -98,8 +97,8 @@ def read_graph(link: RosbridgeLink) -> LiveGraph:
     manager = next((name for name in sorted(services) if name.endswith("/list_controllers")), "")
     rows: Any = link.call(link.namespace + manager, "", {}, TIMEOUT).get("controller") if manager else ()
     controllers = tuple(row for row in rows or () if isinstance(row, Mapping))
-    info = ask(link, link.namespace + INFO_SERVICE)
-    name = "" if info is None else read_info(info.get("message"), INFO_SERVICE).name
+    info = robot_info(link)
+    name = "" if info is None else info.name
     joints, urdf = _heard(link, topics)
     return LiveGraph(link.url, topics, services, actions, manager, controllers, joints, name, urdf)
 

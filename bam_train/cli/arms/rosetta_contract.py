@@ -1,6 +1,8 @@
 """Contracts of rosetta, a bridge between LeRobot and ROS 2: read as the graph of a robot, and written of a profile.
 
-A contract names topics, types and joints, as a live graph does; what it does not say is assumed in the same way.
+A contract names topics, types and joints, as a live graph does; what it does not say is assumed in the same way. As in
+rosetta, an unknown key is an error. What a profile has no use for is skipped (``qos``, ``align``, units of the data
+set, sections of recordings and of teleoperation), except what would change the commands that are sent.
 """
 
 from __future__ import annotations
@@ -12,14 +14,23 @@ from typing import Any
 import yaml
 
 from bam_envs.core.errors import InvalidValue
+from bam_envs.core.wording import brief, did_you_mean
 from bam_envs.robots.profile import syntax_fault
 from bam_envs.ros.messages import bare_type, has_header
 from bam_envs.ros.profile_tables import RobotProfile, Sink, Source
 from bam_train.cli.arms.live_graph import LiveGraph, Row
 
-_IMAGES = "observation.images."
+_IMAGES, _JOINTS = "observation.images.", "sensor_msgs/JointState"
 _SIGNALS = ("joint_position", "gripper_width", "base_velocity")
 """What the state of a written contract has."""
+_SOURCE = ("channel", "align", "select", "apply", "kind")
+_CHANNEL = ("topic", "type", "qos", "dtype", "decoder", "encoder", "safety")
+_TOP = (
+    *("robot_type", "robot_interface", "fps", "observations", "actions", "tasks", "teleop", "adjunct"),
+    *("rewards", "signals", "info", "complementary_data"),
+)
+_ANCHORS = "x-"
+"""Start of the keys of a contract that hold YAML's anchors."""
 _Entry = tuple[tuple[str, str], str, tuple[str, ...]]
 """Key and topic, type, and what is selected, of an entry of a section."""
 
@@ -33,7 +44,8 @@ def contract_graph(path: Path, robot: str) -> LiveGraph:
     try:
         table: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
         told, sections = str(table["robot_type"]), ("observations", "actions")
-        seen, acts = ([*_entries(table[name])] for name in sections)
+        seen, acts = ([*_entries(table[name], f"{path}: {name}")] for name in sections)
+        _require_known({key: 0 for key in table if not str(key).startswith(_ANCHORS)}, _TOP, f"{path}: ")
         topics = {one["topic"]: bare_type(one["type"]) for one in map(_channel, table.get("adjunct") or ())}
         topics |= {key[1]: bare_type(kind) for key, kind, _ in (*seen, *acts)}
     except OSError as error:
@@ -51,7 +63,7 @@ def contract_graph(path: Path, robot: str) -> LiveGraph:
             if one.startswith(("velocity.", "effort.")):
                 text = f"the action on {topic} selects {one}, and the joints of an arm are commanded by position"
                 raise InvalidValue(f"{path}: {text}. Name a topic of positions there, such as that of a trajectory.")
-    states = [one for one in seen if bare_type(one[1]) == "sensor_msgs/JointState"]
+    states = [one for one in seen if bare_type(one[1]) == _JOINTS]
     cameras = tuple(
         {"name": key.removeprefix(_IMAGES), "topic": topic, "type": bare_type(kind), "optional": True}
         for (key, topic), kind, _ in seen
@@ -62,12 +74,38 @@ def contract_graph(path: Path, robot: str) -> LiveGraph:
     return LiveGraph(str(path), topics, frozenset(), {}, "", (), joints, name, commands=_joints(acts), cameras=cameras)
 
 
-def _entries(section: Row) -> Iterator[_Entry]:
+def _entries(section: Row, where: str) -> Iterator[_Entry]:
     for key, rows in section.items():
+        at = f"{where}.{key}: "
         for row in rows if isinstance(rows, list) else [rows]:
             channel = _channel(row)
+            _require_known(row, _SOURCE, at)
+            _require_known(channel, _CHANNEL, at)
+            if where.endswith("actions"):
+                _require_plain(row, channel, at)
+            elif channel.get("decoder") and bare_type(str(channel["type"])) == _JOINTS:
+                raise InvalidValue(f"{at}its decoder gives other numbers than the topic has. Leave it out.")
             selected = tuple(map(str, row.get("select") or ()))
             yield (str(key), str(channel["topic"])), str(channel["type"]), selected
+
+
+def _require_known(table: Row, known: Sequence[str], at: str) -> None:
+    for key in table:
+        if key not in known:
+            raise InvalidValue(f"{at}unknown key {brief(key)}. {did_you_mean(key, known)}")
+
+
+def _require_plain(row: Row, channel: Row, at: str) -> None:
+    """Refuse what would change the commands on their way: a profile sends them as they are."""
+    if channel.get("encoder"):
+        raise InvalidValue(f"{at}its encoder writes messages that a profile cannot. Name a topic that needs none.")
+    for one in row.get("apply") or ():
+        name = next(iter(one)) if isinstance(one, dict) else one
+        if name != "rad2deg":
+            raise InvalidValue(
+                f"{at}apply has {brief(name)}, and a profile sends commands as they are. Leave it out, and give the "
+                "limits to the robot's description."
+            )
 
 
 def _joints(entries: Sequence[_Entry]) -> dict[str, tuple[str, ...]]:

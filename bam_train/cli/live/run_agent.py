@@ -21,15 +21,13 @@ if TYPE_CHECKING:
 
 FOR_ANY_ROBOT = ("robot_name", "stage", "i_know", "keys", "allow_unsigned", "unusual")
 """Flags of a robot that the simulated one of an agent has too."""
-_NICENESS = -10
-"""Of an agent, if the system permits it: other programs' work makes neither a tick nor a halt wait."""
 
 
 def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags; returns 128 + the signal that ended it."""
     from bam_train.agent.agent_messages import Front
     from bam_train.agent.audit import Audit
-    from bam_train.agent.child_processes import FrontLink, SimulatedBox
+    from bam_train.agent.child_processes import FrontLink, SimulatedBox, go_first
     from bam_train.agent.resident import COMMAND_LIFETIME, Resident
     from bam_train.agent.versions import Versions
     from bam_train.checkpoint import Checkpoint
@@ -103,13 +101,6 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
                 tell("interrupted: the robot is halted, and nobody drives it")
                 return 128 + resident.switch.came[0]
     return 0
-
-
-def go_first() -> None:
-    """Go before other programs, if the system permits it and nobody chose another niceness; so do later children."""
-    with suppress(AttributeError, OSError):
-        if os.getpriority(os.PRIO_PROCESS, 0) == 0:
-            os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
 
 
 def _remove(new: Sequence[Path], folder: Path) -> None:

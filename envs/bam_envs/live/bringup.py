@@ -15,7 +15,7 @@ from typing import Any
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady, ProtocolError, RemoteError, StaleState
 from bam_envs.core.timing import Deadline
 from bam_envs.live.state import LiveState, Mailbox
-from bam_envs.ros.codec import RobotInfo, has_room
+from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, has_room, read_info
 from bam_envs.ros.freshness import Tagger, read_tag
 from bam_envs.ros.messages import bare_type, same_type, tag_text
 from bam_envs.ros.profile_tables import Enable, Readiness, RobotProfile, Sink
@@ -63,6 +63,17 @@ def ask(
         if tries == 1 or not link.is_up:
             raise
         return ask(link, service, tries - 1, request=request)
+
+
+def robot_info(link: RosBus) -> RobotInfo | None:
+    """The robot's description of itself; None if it has none.
+
+    Raises:
+        ProtocolError: It cannot be read, or something without a robot is served there.
+    """
+    service = link.namespace + INFO_SERVICE
+    answer = ask(link, service)
+    return None if answer is None else read_info(answer.get("message"), f"{link.url}: {service}")
 
 
 def enable(link: RosBus, services: Iterable[Enable], profile: RobotProfile, *, needed: bool) -> None:

@@ -14,12 +14,11 @@ from typing import Any, Literal
 import numpy as np
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady, ProtocolError, StaleState
-from bam_envs.core.location import LiveRobot
+from bam_envs.core.location import LiveRobot, is_loopback
 from bam_envs.live import bringup
 from bam_envs.live.building import live_robot, require_robot_address
 from bam_envs.live.examination import PING_TOPIC, Array, Inspection, Reading, inspect_robot
 from bam_envs.robots.profile import load_profile, own_profile, profile_for, shipped_profiles
-from bam_envs.ros.codec import INFO_SERVICE, read_info
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.bus import namespaces_with
 from bam_envs.rosbridge.client import RosbridgeLink
@@ -134,11 +133,9 @@ class Diagnosis:
 
     def _rosbridge(self) -> Findings:
         self._link.connect()
-        service, ros = self._link.namespace + INFO_SERVICE, self._link.ros
+        ros, info = self._link.ros, bringup.robot_info(self._link)
         found = ["answers" + ("" if ros is None else f" as ROS {ros[-1]}")]
-        answer = bringup.ask(self._link, service)
-        if answer is not None:
-            info = read_info(answer.get("message"), service)
+        if info is not None:
             found.append(f"the robot describes itself: {info.text or info.name}")
             if self.profile is None and own_profile(info.name) is not None:
                 self.profile = load_profile(info.name)
@@ -214,7 +211,7 @@ class Diagnosis:
             reading = inspection.readings[signal.name]
             key = (reading.source.topic, reading.source.names)
             limit = max(reading.source.max_age or 0.0, profile.max_age)
-            _require_states(reading, limit, seconds, inspection)
+            _require_states(reading, limit, seconds, inspection, here=is_loopback(self.endpoint.address.host))
             if key not in seen:
                 found.append(f"{reading.source.topic} {reading.rate:.4g} Hz, age {_p50_p99(reading.ages)}")
                 warnings += _warnings_about(reading, limit, period)
@@ -308,8 +305,11 @@ class Diagnosis:
         return self.inspection
 
 
-def _require_states(reading: Reading, limit: float, seconds: float, inspection: Inspection) -> None:
-    """Raise an error unless a deployment could use these states; `limit` is their maximum age [s]."""
+def _require_states(reading: Reading, limit: float, seconds: float, inspection: Inspection, *, here: bool) -> None:
+    """Raise an error unless a deployment could use these states; `limit` is their maximum age [s].
+
+    `here` says whether the server is on this computer.
+    """
     topic, kind = reading.source.topic, reading.source.type
     if not reading.count:
         raise StaleState(
@@ -322,22 +322,25 @@ def _require_states(reading: Reading, limit: float, seconds: float, inspection: 
     if p99 > limit:
         raise StaleState(
             f"{topic}: the newest state is up to {_ms(p99)} old (p99), and {_ms(limit)} is the limit (max_age in the "
-            f"profile), at {reading.rate:.3g} Hz. {_why_old(reading, limit, inspection)}",
+            f"profile), at {reading.rate:.3g} Hz. {_why_old(reading, limit, inspection, here=here)}",
             p99,
             limit,
         )
 
 
-def _why_old(reading: Reading, limit: float, inspection: Inspection) -> str:
-    """The cause of states that are older than `limit` [s], and its remedy, in sentences."""
-    if reading.delays[-1] - reading.delays[0] > (reading.arrived[-1] - reading.arrived[0]) / 2:
-        return "Their stamp stands still: the driver repeats an old measurement. Start it again."
+def _why_old(reading: Reading, limit: float, inspection: Inspection, *, here: bool) -> str:
+    """The cause of states that are older than `limit` [s], and its remedy, in sentences.
+
+    A busy computer is late with messages and pings that it reads, and with all that a driver on it does; not with the
+    clock of another computer, nor with what that sends too rarely.
+    """
     trips, late, rarely = inspection.round_trips, float(np.median(reading.delays)), reading.rate < 2 / limit
     way = float(np.median(trips)) / 2 if len(trips) else 0.0
-    simulated = inspection.info is not None and inspection.info.simulated
-    if inspection.busy and (simulated or (late <= limit and not rarely)):
+    if inspection.busy and (here or (not rarely and (late <= limit or way > late / 2))):
         return f"But {inspection.busy}, and the robot may be in time: close other programs, and measure again."
-    if rarely:
+    if reading.delays[-1] - reading.delays[0] > (reading.arrived[-1] - reading.arrived[0]) / 2:
+        return "Their stamp stands still: the driver repeats an old measurement. Start it again."
+    if late <= limit and rarely:
         return "They come too rarely: raise the rate of their driver."
     if late <= limit:
         return "They come in bursts, with pauses between: the network, or a busy computer on the way, holds them back."

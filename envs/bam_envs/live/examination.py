@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError
 from bam_envs.core.robot import RobotSpec
 from bam_envs.core.timing import BUSY, Deadline, Pacer, is_disturbed
-from bam_envs.live.bringup import TIMEOUT, TopicTypes, ask, least_interval, tagged_sinks
+from bam_envs.live.bringup import TIMEOUT, TopicTypes, least_interval, robot_info, tagged_sinks
 from bam_envs.live.command_proof import CommandProof, needed_proof, robot_identity
 from bam_envs.live.state import Letter, Mailbox, SourceAge, concerns
 from bam_envs.robots.linked import LinkProfile
-from bam_envs.ros.codec import DESCRIPTION_TOPIC, INFO_SERVICE, RobotInfo, decode_source, read_info
+from bam_envs.ros.codec import DESCRIPTION_TOPIC, RobotInfo, decode_source
 from bam_envs.ros.messages import same_type
 from bam_envs.ros.profile_tables import RobotProfile, Sink, Source
 from bam_envs.rosbridge.client import RosbridgeLink
@@ -224,9 +224,7 @@ def inspect_robot(
     extra = tuple(source for source in profile.state if source.signal in TOOL_POSE and source not in required)
     longest = max((source.max_age or profile.max_age) for source in required)
     listen = max(LISTEN, _AGES * longest) if listen is None else listen
-    service, epoch = link.namespace + INFO_SERVICE, link.epoch
-    answer = ask(link, service)
-    info = None if answer is None else read_info(answer.get("message"), service)
+    epoch, info = link.epoch, robot_info(link)
     sinks = (tagged_sinks(narrowed, None) if info is not None else None) or narrowed.sinks()
     sinks = tuple(form for sink in sinks for form in sink.forms)
     topical = [sink for sink in sinks if sink.topic]
@@ -288,11 +286,14 @@ def _are_echoed(link: RosbridgeLink, inbox: Mailbox, timeout: float) -> bool:
 
 
 def _measure(link: RosbridgeLink, inbox: Mailbox, period: float, seconds: float, *, pings: bool) -> dict[str, Any]:
-    """Tick for `seconds` while messages come, with a ping in each tick; the fields of `Inspection` about that."""
+    """Tick for `seconds` while messages come, with a ping in each tick; the fields of `Inspection` about that.
+
+    A busy computer, which misses ticks, takes longer for the fewest pings.
+    """
     name, sent, ticks, late = secrets.token_hex(4), dict[str, float](), list[float](), list[bool]()
     pacer, enough = Pacer(period), Deadline(seconds)
     pacer.start()
-    while link.is_up and not enough.passed:
+    while link.is_up and not (enough.passed and (len(sent) >= _MIN_ECHOES or not pings)):
         late.append(is_disturbed(pacer.wait(), period))
         ticks.append(time.monotonic())
         if pings:

@@ -39,12 +39,10 @@ from bam_envs.live.take_over import TakeOver
 from bam_envs.robots.splines import SetPoints
 from bam_envs.ros.codec import (
     HALT_TOPIC,
-    INFO_SERVICE,
     SCENE_TOPIC,
     STATUS_TOPIC,
     RobotInfo,
     encode_sink,
-    read_info,
 )
 from bam_envs.ros.freshness import Tag
 from bam_envs.ros.profile_tables import SPLINE_PERIODS, Enable, RobotProfile, Sink
@@ -200,9 +198,7 @@ class RosbridgeRobot:
         control.on_status(self._on_status)
         control.connect()
         halting.connect()
-        service = self.namespace + INFO_SERVICE
-        answer = bringup.ask(control, service)
-        info = None if answer is None else read_info(answer.get("message"), service)
+        info = bringup.robot_info(control)
         self._describes_itself, self._info = info is not None, info or bringup.info_by_profile(self.url, self.profile)
         if info is not None:
             tagged = bringup.tagged_sinks(self.profile, self._mode)

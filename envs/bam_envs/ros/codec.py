@@ -36,6 +36,7 @@ Message = Mapping[str, Any]
 Envelope = tuple[str, str, dict[str, Any]]  # topic, type, message
 Sign = Callable[[Tag, str, bytes], str]  # the text of a tag on a topic with that content; `Tagger.sign` is one
 INFO_SERVICE = "/bam/robot"  # describes a served robot (std_srvs/Trigger; `RobotInfo` in its message)
+SERVES, A_POLICY = "serves", "a policy"  # where there is no robot: the key of what is served there, and a policy
 AGENT_TOPIC = "/bam/agent"
 """Requests to the live agent of a robot: who drives, take over, hand back; see `bam_envs.live.take_over`."""
 AGENT_STEP_TOPIC = "/bam/agent/step"
@@ -75,11 +76,19 @@ class RobotInfo:
 
 
 def read_info(text: object, where: str) -> RobotInfo:
-    """The `RobotInfo` in `text`, without keys of a newer version; `ProtocolError` for anything else."""
+    """The `RobotInfo` in `text`, without keys of a newer version.
+
+    Raises:
+        ProtocolError: Something without a robot is served there, or it is no description.
+    """
     try:
         data = json.loads(text) if isinstance(text, str) else None
     except ValueError:
         data = None
+    if isinstance(data, dict) and isinstance(served := data.get(SERVES), str):
+        if served == A_POLICY:
+            raise ProtocolError(f"{where}: that is a policy server, and no robot; give its address as --policy-server.")
+        raise ProtocolError(f"{where}: {brief(served)} is served there, and no robot; give its address as --transport.")
     if not isinstance(data, dict) or not isinstance(data.get("name"), str):
         raise ProtocolError(f"{where}: the answer must describe the robot, not {brief(text)}.")
     known = {key: data[key] for key in RobotInfo.__dataclass_fields__ if key in data}

@@ -109,10 +109,11 @@ def state(url, *expected):
 
 
 @pytest.mark.slow
-def test_an_agent_that_was_killed_starts_paused_and_is_written_down(tmp_path):
+def test_an_agent_that_was_killed_starts_paused_and_is_written_down(tmp_path, until):
     folder = tmp_path / "agent"
     with service(folder) as (process, url):
         state(url, "running")
+        until(lambda: "running" in (event.get("to") for event in tail(folder / "audit.jsonl")))  # another thread writes
         process.kill()
     with service(folder) as (process, url):
         assert state(url, "paused")["why"] == ROBOT_FITS

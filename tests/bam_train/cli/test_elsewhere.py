@@ -14,12 +14,12 @@ import pytest
 
 from bam_envs.core.errors import LinkLost
 from bam_envs.core.kinematics import UR_JOINTS
-from bam_envs.live import rosbridge_robot
+from bam_envs.live import bringup
+from bam_envs.live.bringup import robot_info
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.remote.serve.tcp_server import TcpServer
-from bam_envs.ros.codec import read_info
 from bam_envs.ros.images import color_message
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
@@ -204,7 +204,7 @@ def test_a_server_that_hangs_is_waited_for_as_long_as_one_wants(corridor, corrid
 
 
 def test_a_real_robot_is_shown_and_does_not_move_unasked(serve, run, monkeypatch):
-    monkeypatch.setattr(rosbridge_robot, "read_info", lambda *said: replace(read_info(*said), simulated=False))
+    monkeypatch.setattr(bringup, "robot_info", lambda link: replace(robot_info(link), simulated=False))
     served = serve(gym.make("bam/pick-v0", disable_env_checker=True), fast=True)
     unsigned = f"{PICK}: is not signed. Sign it with bam-sign sign {PICK} --key FILE"
     status, out, err = run(deploy, PICK, "--robot", served.bus.url, "--yes")

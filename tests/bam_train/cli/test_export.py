@@ -122,7 +122,7 @@ def test_names_of_files(run, refused, folder):
         assert out.startswith(f"{name}: ppo on")
     assert err == "bam-export: ppo.zip exists: the checkpoint goes to ppo-2.zip (--force overwrites)\n"
     assert run(main, OLD_LAYOUT / "ppo", "--out", "ppo.zip", "--force")[1].startswith("ppo.zip: ppo on")
-    text = refused(OLD_LAYOUT / "ppo", "--out", "ppo.tar")
+    text = refused(OLD_LAYOUT / "ppo", "--env", "CartPole-v1", "--out", "ppo.tar")  # before anything else
     assert text == "ppo.tar: expected a file name that ends in .zip. Choose another one with --out"
 
 

@@ -290,14 +290,16 @@ def test_no_server_no_rosapi_and_a_file_that_is_there(run, graph, tmp_path):
 
 
 CONTRACT = """robot_type: so_lab
+robot_interface: ros2
 fps: 30
+x-qos: &state {reliability: best_effort, history: keep_last, depth: 50}
 observations:
   observation.images.wrist:
     channel: {topic: /wrist/image_raw/compressed, type: sensor_msgs/msg/CompressedImage}
     align: {strategy: hold, timeline: header}
     apply: [resize: [512, 512]]
   observation.state:
-    - channel: {topic: /follower/joint_states, type: sensor_msgs/msg/JointState}
+    - channel: {topic: /follower/joint_states, type: sensor_msgs/msg/JointState, qos: *state, dtype: float32}
       select: [position.jaw, position.roll, position.wrist_flex, position.elbow, position.lift, position.pan]
       apply: [rad2deg]
     - channel: {topic: /imu, type: sensor_msgs/msg/Imu}
@@ -306,6 +308,9 @@ actions:
   action:
     channel: {topic: /leader/joint_states, type: sensor_msgs/msg/JointState}
     select: [position.jaw, position.roll, position.wrist_flex, position.elbow, position.lift, position.pan]
+tasks: {task: {channel: {topic: /task_prompt, type: std_msgs/msg/String}}}
+adjunct:
+  - channel: {topic: /scan, type: sensor_msgs/msg/LaserScan}
 """
 RENAMED = {"shoulder_pan": "pan", "shoulder_lift": "lift", "elbow_flex": "elbow", "wrist_roll": "roll"}
 
@@ -366,7 +371,30 @@ def test_a_contract_of_rosetta_says_topics_joints_and_their_order(run, contract,
         (("actions:", "actions: []\nacts:"), "not a contract of rosetta. Give a YAML file with robot_type"),
         (
             ("fps: 30", "fps: ["),
-            "is not YAML: expected ',' or ']', but got ':' (at line 4, column 27). Correct it there.\n",
+            "is not YAML: expected ',' or ']', but got '<scalar>' (at line 5, column 1). Correct it there.\n",
+        ),
+        (("fps: 30", "fpss: 30"), "unknown key 'fpss'. Did you mean 'fps'?\n"),
+        (
+            ("actions:\n  action:\n", "actions:\n  action:\n    selects: []\n"),
+            "actions.action: unknown key 'selects'. Did you mean 'select'?\n",
+        ),
+        (
+            ("topic: /imu,", "topic: /imu, units: deg,"),
+            "observations.observation.state: unknown key 'units'. Choose from: decoder, dtype, encoder, qos, safety, "
+            "topic, type.\n",
+        ),
+        (
+            ("actions:\n  action:\n", "actions:\n  action:\n    apply: [rad2deg, clamp: {min: -1, max: 1}]\n"),
+            "actions.action: apply has 'clamp', and a profile sends commands as they are. Leave it out, and give the "
+            "limits to the robot's description.\n",
+        ),
+        (
+            ("/leader/joint_states, type", "/leader/joint_states, encoder: 'own:encode', type"),
+            "actions.action: its encoder writes messages that a profile cannot. Name a topic that needs none.\n",
+        ),
+        (
+            ("/follower/joint_states, type", "/follower/joint_states, decoder: 'own:decode', type"),
+            "observations.observation.state: its decoder gives other numbers than the topic has. Leave it out.\n",
         ),
         (
             (

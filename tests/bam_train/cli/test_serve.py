@@ -66,6 +66,8 @@ def test_a_policy_is_served(start, chunk_checkpoint, corridor_checkpoint, run):
     process, line = start("--policy", str(checkpoint), "--port", "0", "--tcp", "0")
     url = re.fullmatch(r"bam-serve: a policy on (ws://127\.0\.0\.1:\d+), fast: /gym_env/gym_api_request\n", line)[1]
     assert re.fullmatch(r"bam-serve: a policy on tcp://127\.0\.0\.1:\d+\n", process.stderr.readline())
+    _, line = start("--policy", str(checkpoint), "--tcp", "0")  # and no other port
+    assert re.fullmatch(r"bam-serve: a policy on tcp://127\.0\.0\.1:\d+\n", line)
     assert PolicyLink(url).inputs == {"observation": Tensor((1, 6), "float32")}
     text = "--policy serves a policy, and no environment: leave out --set, --robot-model, --num-envs"
     assert run(main, "--policy", checkpoint, "--num-envs", 2) == (1, "", f"bam-serve: {text}\n")

@@ -13,10 +13,10 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue, LinkLost, NotInCommand
 from bam_envs.core.location import HERE, LiveRobot
-from bam_envs.live import rosbridge_robot
+from bam_envs.live import bringup
+from bam_envs.live.bringup import robot_info
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
-from bam_envs.ros.codec import read_info
 from bam_envs.safety.guard import BOUNDS, Limits
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
@@ -241,7 +241,7 @@ def test_flags_that_do_not_fit(run, flags, text):
 def served(monkeypatch, tmp_path):
     """Serves an arm of that name that seems to be real."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(rosbridge_robot, "read_info", lambda *said: replace(read_info(*said), simulated=False))
+    monkeypatch.setattr(bringup, "robot_info", lambda link: replace(robot_info(link), simulated=False))
     with ExitStack() as stack:
 
         def serve(name=""):

@@ -11,6 +11,7 @@ from bam_envs.remote.serve.command_lease import LEASE_SECONDS
 from bam_envs.remote.wire.gymapi_versions import version_named
 
 _NAMESPACE = re.compile(r"(/[A-Za-z]\w*)*")
+DEFAULT_PORT = 9090
 _EXCLUDE = (("realtime", "fast"), ("via", "rclpy"), ("via", "cert"), ("rclpy", "cert"), ("no_token", "token_file"))
 
 
@@ -21,8 +22,8 @@ class ServeOptions(Credentials):
     The token file has a secret that clients must show; with `via`, that of the server there, which `ca_file` is for.
     """
 
-    port: Port = 9090
-    """Port of the rosbridge server; 0 takes a free one."""
+    port: Port | None = None
+    """Port of the rosbridge server, 0 for a free one; 9090 by default, and with --tcp alone there is none."""
     bind: str = "127.0.0.1"
     """Address to listen on; 127.0.0.1 is this computer only, 0.0.0.0 all its networks."""
     namespace: str = ""
@@ -30,7 +31,7 @@ class ServeOptions(Credentials):
     name: RobotName = ""
     """Name that the robot tells its clients, to tell it from others: trials count for the robot of that name."""
     tcp: Port | None = None
-    """Serve the environment on this TCP port too, which is faster; 0 takes a free one."""
+    """Serve the environment on this TCP port, which is faster; 0 takes a free one."""
     via: str | None = None
     """Offer everything through the rosbridge server at this address (ws://10.0.0.5:9090) instead of a new one."""
     rclpy: bool = False
@@ -86,6 +87,11 @@ class ServeOptions(Credentials):
     def listens(self) -> bool:
         """Whether clients connect to this program."""
         return self.tcp is not None or not (self.via or self.rclpy)
+
+    @property
+    def has_topics(self) -> bool:
+        """Whether topics and services are asked for, and not the TCP port alone."""
+        return self.tcp is None or self.port is not None or self.via is not None or self.rclpy
 
     @property
     def _is_open(self) -> bool:

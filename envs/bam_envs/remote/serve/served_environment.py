@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -15,15 +16,15 @@ from bam_envs.remote.serve.command_lease import CommandLease
 from bam_envs.remote.serve.env_server import Env, EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
 from bam_envs.remote.serve.robot_service import RobotService
-from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.serve_options import DEFAULT_PORT, ServeOptions
 from bam_envs.remote.serve.served_robot import ServedRobot
 from bam_envs.remote.serve.tcp_server import TcpServer
 from bam_envs.remote.wire.gymapi_messages import base_name, service_name
 from bam_envs.remote.wire.ros2_node import RclpyBus
 from bam_envs.robots.profile import profile_for
-from bam_envs.ros.codec import INFO_SERVICE
+from bam_envs.ros.codec import INFO_SERVICE, SERVES
 from bam_envs.ros.profile_tables import RobotProfile
-from bam_envs.rosbridge.bus import Bus
+from bam_envs.rosbridge.bus import Bus, Message
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.server import BridgeServer
@@ -61,7 +62,7 @@ class ServedEnvironment:
         self.lease = CommandLease(options.lease)
         """The lease on command."""
         self.bus: Bus | None = None
-        """The bus for topics and services."""
+        """The bus for topics and services; None if the TCP transport alone is asked for."""
         self.tcp: TcpServer | None = None
         """The TCP transport, if there is one."""
         self._tell, self._stack, self._paced = tell, ExitStack(), paced
@@ -93,9 +94,10 @@ class ServedEnvironment:
 
     def _start(self, started: ExitStack) -> None:
         options, profile = self.options, _profile_of(self.env)
+        realtime = options.realtime or (profile is not None and not options.fast)
+        profile = profile if options.has_topics else None
         if options.name and profile is None:
             raise InvalidValue("--name is the name of a robot, and no robot is served here; leave it out.")
-        realtime = options.realtime or (profile is not None and not options.fast)
         robot = None if profile is None else _take_robot(self.env, profile, realtime)
         server = EnvServer(self.env, lease=self.lease, realtime=realtime and robot is None)
         started.callback(server.close)
@@ -104,41 +106,46 @@ class ServedEnvironment:
         )
         if options.warning is not None:
             self._tell(options.warning)
-        self.bus = bus = self._open_bus(started)
-        if robot is not None and profile is not None:
-            if isinstance(bus, RosbridgeLink):
-                self._require_own_names(bus)
-            self.robot_service = RobotService(
-                robot,
-                profile,
-                bus,
-                self.lease,
-                namespace=self.prefix,
-                identity=options.name,
-                paced=self._paced,
-                description=_description_of(robot),
-            )
-            started.callback(self.robot_service.close)
-            self.robot_service.start()
-        started.callback(server.end)  # while the robot's clock still ticks: a step that runs waits for it
-        service = GymApiService(
-            server, bus, self.prefix, image_format=options.image_format, version=options.gymapi_version
-        )
-        started.callback(service.close)
-        service.start()
-        served_as, pace = getattr(self.env, "served_as", ""), "real time" if realtime else "fast"
+        served_as = getattr(self.env, "served_as", "")
         name = served_as or server.spec().env_id
-        offered = self._offered(profile, self._not_offered())
-        if offered:
-            node = getattr(bus, "url", "a bus")
-            if isinstance(bus, RclpyBus):
-                node = f"the ROS 2 graph as the node {bus.name}"
-            self.endpoints.append(f"{name} on {node}, {pace}: {offered}")
+        if options.has_topics:
+            self.bus = bus = self._open_bus(started)
+            if robot is not None and profile is not None:
+                self._serve_robot(robot, profile, bus, started)
+            elif isinstance(bus, BridgeServer):  # no other robot can be there
+                bus.serve(self.prefix + INFO_SERVICE, "std_srvs/Trigger", lambda *_: _no_robot(name))
+            started.callback(server.end)  # while the robot's clock still ticks: a step that runs waits for it
+            self._serve_gymapi(server, bus, started)
+            if offered := self._offered(profile, self._not_offered()):
+                node = getattr(bus, "url", "") or f"the ROS 2 graph as the node {getattr(bus, 'name', '')}"
+                self.endpoints.append(f"{name} on {node}, {'real time' if realtime else 'fast'}: {offered}")
         if options.tcp is not None:
             token, operator = self._token, self._operator_token
             tcp = TcpServer(server, options.bind, options.tcp, token=token, operator_token=operator)
             self.tcp = started.enter_context(tcp)
             self.endpoints.append(f"{name} on {self.tcp.url}{'' if served_as else ', the environment alone'}")
+
+    def _serve_robot(self, robot: ServedRobot, profile: RobotProfile, bus: Bus, started: ExitStack) -> None:
+        if isinstance(bus, RosbridgeLink):
+            self._require_own_names(bus)
+        self.robot_service = RobotService(
+            robot,
+            profile,
+            bus,
+            self.lease,
+            namespace=self.prefix,
+            identity=self.options.name,
+            paced=self._paced,
+            description=_description_of(robot),
+        )
+        started.callback(self.robot_service.close)
+        self.robot_service.start()
+
+    def _serve_gymapi(self, server: EnvServer, bus: Bus, started: ExitStack) -> None:
+        formats: Any = {"image_format": self.options.image_format, "version": self.options.gymapi_version}
+        service = GymApiService(server, bus, self.prefix, **formats)
+        started.callback(service.close)
+        service.start()
 
     @property
     def prefix(self) -> str:
@@ -164,7 +171,7 @@ class ServedEnvironment:
             return link
         server = BridgeServer(
             options.bind,
-            options.port,
+            DEFAULT_PORT if options.port is None else options.port,
             cert=options.cert,
             key=options.key,
             token=self._token,
@@ -235,6 +242,10 @@ class ServedEnvironment:
         if not offered and self.options.tcp is None:
             raise RemoteError(f"{self.options.via or 'ROS 2 here'} carries nothing of use of what is served here.")
         return " and ".join(offered)
+
+
+def _no_robot(name: str) -> Message:
+    return {"success": False, "message": json.dumps({SERVES: name})}
 
 
 def _profile_of(env: Env) -> RobotProfile | None:

@@ -1,11 +1,13 @@
+import re
 import threading
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from bam_envs.core.errors import InvalidValue, NoServer, NotInCommand, RemoteError, RobotFault
+from bam_envs.core.errors import InvalidValue, NoServer, NotInCommand, ProtocolError, RemoteError, RobotFault
 from bam_envs.core.registry import ENVIRONMENTS
+from bam_envs.live.bringup import robot_info
 from bam_envs.remote.rosbridge_transport import RosbridgeTransport
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_robot import ServedRobot
@@ -81,6 +83,26 @@ def test_an_environment_without_a_robot_has_no_topics(serve_env, transport):
     assert served.endpoints == [f"CartPole-v1 on {served.bus.url}, fast: /gym_env/gym_api_request"]
     observation, _ = transport(RosbridgeTransport, served.bus.url).reset(3)
     np.testing.assert_array_equal(observation, gym.make("CartPole-v1").reset(seed=3)[0])
+
+
+def test_the_tcp_port_alone(serve_env, transport):
+    served = serve_env(port=None, tcp=0)
+    assert (served.bus, served.robot_service) == (None, None)
+    assert served.endpoints == [f"bam/pick-v0 on {served.tcp.url}, the environment alone"]
+    remote = transport(TcpTransport, served.tcp.url)
+    remote.reset(5)
+    remote.step(RISE)
+    with pytest.raises(InvalidValue, match=r"^--name is the name of a robot, and no robot is served here; leave it"):
+        serve_env(port=None, tcp=0, name="arm")
+
+
+def test_a_robot_is_looked_for_where_none_is(serve_env, link):
+    served = serve_env("CartPole-v1")
+    text = (
+        f"{served.bus.url}: /bam/robot: 'CartPole-v1' is served there, and no robot; give its address as --transport."
+    )
+    with pytest.raises(ProtocolError, match=f"^{re.escape(text)}$"):
+        robot_info(link(served.bus.url))
 
 
 @pytest.mark.parametrize("kind", [RosbridgeTransport, TcpTransport])
