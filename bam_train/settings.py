@@ -129,6 +129,10 @@ class SB3Settings(TrainSettings):
     """Checkpoint whose weights a new run of sb3 begins with: to harden a policy with env_kwargs.randomize, say."""
     coarse_physics: bool = False
     """Train on physics of an arm in longer steps, in half the time (sb3); evaluations are on the usual one."""
+    near_starts: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    """Share of training episodes after a failed one that begin near the goal, if the task has such starts (sb3)."""
+    mirror: bool = False
+    """Learn from the mirror image of every rollout too, left and right exchanged, of a task that has one (sb3)."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +184,9 @@ NAMES = tuple(AllSettings.__dataclass_fields__)
 """Names of all top-level settings."""
 _NO_USE = {
     **dict.fromkeys(NAMES, "the {trainer} trainer has no use for it; leave it out, or add --trainer rllib"),
-    **dict.fromkeys(("start", "coarse_physics"), "the {trainer} trainer has no use for it; leave it out"),
+    **dict.fromkeys(
+        ("start", "coarse_physics", "near_starts", "mirror"), "the {trainer} trainer has no use for it; leave it out"
+    ),
     "data": "{algo} of {trainer} learns in the environment; leave --data or --trainer out",
     "teacher": "{algo} has none; leave it out, or give --algo dagger",
 }

@@ -45,6 +45,8 @@ _METAVARS = {
     "data": "PLACE",
     "start": "CHECKPOINT",
     "coarse_physics": "True|False",
+    "near_starts": "SHARE",
+    "mirror": "True|False",
     "teacher": "PLACE|scripted",
     "transport": "URL,...",
     "ca_file": "FILE",
@@ -187,7 +189,7 @@ class TrainConfig(SettingsFlags, RobotModelFlag):  # type: ignore[misc]
 
     GROUPS: ClassVar[Groups] = {
         "What is learnt": ("env", "robot_model", "algo", "steps", "seed", "seeds", "until_success"),
-        "Settings": ("set", "config", "print_config", "coarse_physics"),
+        "Settings": ("set", "config", "print_config", "coarse_physics", "near_starts", "mirror"),
         "Files": ("out", "force", "runs", "resume", "start", "copy_to", "record", "track"),
         "Evaluations": ("eval_every", "eval_episodes", "trial_threshold"),
         "From a data set, a teacher or a robot": ("data", "teacher", "learner", "push_every"),

@@ -31,6 +31,7 @@ from bam_train.trainers.base import OnProgress, Progress, Statistics, Trainer
 from bam_train.trainers.resolve_settings import own_settings, require_start
 from bam_train.trainers.run_folder import TensorBoardFiles
 from bam_train.trainers.sb3 import sb3_resume as resume
+from bam_train.trainers.sb3.mirrored_buffer import mirror
 from bam_train.trainers.sb3.sb3_freezing import FrozenModel
 from bam_train.trainers.sb3.sb3_model import make_model
 from bam_train.trainers.sb3.sb3_vec_env import BatchVecEnv, make_training_env, one_env
@@ -77,8 +78,10 @@ class SB3Trainer(Trainer[SB3Settings]):
     def _made(cls, settings: SB3Settings) -> SB3Trainer:
         torch.set_num_threads(settings.threads)
         given = settings.env, settings.env_kwargs, settings.num_envs, settings.place
-        venv = make_training_env(*given, coarse=settings.coarse_physics)
+        venv = make_training_env(*given, coarse=settings.coarse_physics, near=settings.near_starts)
         model, notices = make_model(settings, venv)
+        if settings.mirror and not settings.transport:
+            mirror(model, venv, settings.env)
         model.set_logger(Logger(None, []))
         trainer = cls(settings, model, venv)
         trainer.notices += notices

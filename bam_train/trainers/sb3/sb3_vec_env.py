@@ -23,21 +23,35 @@ Observations = Any
 
 
 def make_training_env(
-    env_id: str, env_kwargs: Mapping[str, Any], num_envs: int, place: Location = HERE, *, coarse: bool = False
+    env_id: str,
+    env_kwargs: Mapping[str, Any],
+    num_envs: int,
+    place: Location = HERE,
+    *,
+    coarse: bool = False,
+    near: float = 0.0,
 ) -> VecEnv:
     """Make `num_envs` environments to train on; those of `bam_envs` can save and restore their state.
 
-    Their physics is `coarse` if that is asked for, unless they are elsewhere; raises SettingsError if it cannot be.
+    Unless they are elsewhere, their physics is `coarse` if that is asked for, and a share of episodes begin `near` the
+    goal; raises SettingsError if that cannot be.
     """
     if is_batched(env_id) or isinstance(place, Remote):
         batch = make_vector_env(env_id, env_kwargs, num_envs, place)
         robot: Any = getattr(batch.unwrapped, "robot", None)
         if hasattr(robot, "coarse"):
             robot.coarse, coarse = coarse, False
-        if not coarse or isinstance(place, Remote):
+        task: Any = getattr(batch.unwrapped, "task", None)
+        while "task" in getattr(task, "__dict__", ()):  # below cameras and a link
+            task = task.task
+        if hasattr(task, "near_starts"):
+            task.near_starts, near = near, 0.0
+        if not (coarse or near) or isinstance(place, Remote):
             return BatchVecEnv(batch, env_id)
     if coarse:
         raise SettingsError(f"coarse_physics: {env_id} has no arm that MuJoCo simulates; leave it out")
+    if near:
+        raise SettingsError(f"near_starts: {env_id} has no starts near its goal; leave it out")
     envs = (FiniteEnv(make_env(env_id, env_kwargs), env_id, index) for index in range(num_envs))
     return DummyVecEnv([functools.partial(Monitor, from_zero(env)) for env in envs])
 

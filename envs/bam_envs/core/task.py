@@ -50,6 +50,11 @@ class Task(Protocol):
     A task may have one more attribute, ``reset_options``: the names of the options that `reset` of its environment
     takes. Its `sample_initial` then has a third argument, ``options``, a mapping of the options in use.
 
+    A task that is the same with left and right exchanged may have ``mirrored``: the names of the labels of observation
+    and action whose numbers change their sign then.
+
+    A task that can begin near its goal, to train on, has ``near_starts``: the share of such starts, 0 at first.
+
     A task with a fixed number of different starts has it as ``num_starts``, and as ``drawn`` the number of the start of
     each environment, from 0 on. Shape: (n,).
     """

@@ -96,6 +96,11 @@ class PickTask(Memory):
     """
 
     memory: Mapping[str, str] = {"rest_height": "rest_height", "held": "held"}
+    mirrored = frozenset(
+        ("tool_y", "target_dy", "yaw", "target_dyaw", "object_y", "object_dy", "object_yaw_sin", "dy", "dyaw")
+    )
+    near_starts = 0.0
+    """Share of the episodes after one that failed that begin near the cube, to train on."""
     moves_straight = True  # the tool, along straight lines: singularities count
 
     def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_ARM) -> None:
@@ -127,8 +132,30 @@ class PickTask(Memory):
         cube = np.empty((len(env_ids), 3))
         cube[:, :2] = area[0] + draws[:, 3:5] * (area[1] - area[0])
         cube[:, 2] = (2 * draws[:, 5] - 1) * np.pi
-        joints = self.table.arm.reach_down(tool, np.zeros(len(env_ids)))
+        yaw = np.zeros(len(env_ids))
+        if self.near_starts:
+            near = self._near(np.stack([rng.random(5) for rng in rngs], axis=1), cube)
+            begins_near = (self.held[env_ids] < HOLD_STEPS) & near[0]
+            tool[begins_near], yaw[begins_near] = near[1][begins_near], near[2][begins_near]
+        joints = self.table.arm.reach_down(tool, yaw)
         return Initial({"joint_position": joints, "object_pose": cube}, seeds)
+
+    def _near(self, draws: Array, cube: Array) -> tuple[Any, Array, Array]:
+        """Whether an episode may begin near the cube; tool [m] and yaw [rad] of the open gripper there.
+
+        It is around the cube, above it, or low and to a side, from where a policy must go up first; nothing touches it.
+        The higher it is, the farther its yaw may be from the cube's.
+        """
+        chosen, height, aside, direction, turned = draws
+        edge, angle, (low, high) = self.table.edge, 2 * np.pi * direction, self.table.box
+        offset = 4 * edge * aside * np.stack([np.cos(angle), np.sin(angle)])
+        place = limited(cube[:, :2] + offset.T, low[:2], high[:2])
+        away = np.hypot(*(place - cube[:, :2]).T)
+        is_beside = (away > 0.25 * edge) & (away < 2.25 * edge)
+        up = edge * (0.5 + np.maximum(2.5 * height, 0.85 * is_beside))
+        tool = np.column_stack([place, limited(up, low[2], high[2])])
+        yaw = (cube[:, 2] + np.pi / 4) % (np.pi / 2) - np.pi / 4
+        return chosen < self.near_starts, tool, yaw * (1 - height * turned)
 
     def on_reset(self, env_ids: EnvIds, state: RobotState) -> None:
         """Record the measured joints and the height of the object."""

@@ -54,6 +54,7 @@ class PickPlaceTask(PickTask):
         from where it would lie at the goal [m].
     """
 
+    mirrored = PickTask.mirrored | {"goal_dy", "goal_near_dy"}
     memory: Mapping[str, str] = {**PickTask.memory, "goal": "goal", "picked": "picked"}
 
     def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_ARM) -> None:

@@ -9,11 +9,12 @@ from gymnasium.utils.env_checker import check_env
 
 from bam_envs.arms.description import ArmDescription, cube_edge, robot_model
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.core.robot import CameraSpec
+from bam_envs.core.robot import CameraSpec, Initial
 from bam_envs.core.robot_models import known_models
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.robots.physics.rendering import RenderingUnavailable, find_backend
-from bam_envs.tasks.pick import PickTask
+from bam_envs.tasks.pick import HOLD_STEPS, PickTask
+from bam_envs.tasks.pick_place import PickPlaceTask
 from bam_envs.tasks.reach import ReachTask
 from bam_envs.tasks.scripted import scripted_policy
 from bam_envs.testing.assertions import assert_same_state, assert_same_value
@@ -188,3 +189,62 @@ def test_a_state_of_before_without_the_last_changes_of_commands_opens(make, env_
     other.unwrapped.load_state_dict(saved)
     np.testing.assert_array_equal(other.unwrapped.state.command, one.unwrapped.state.command)
     other.step(other.action_space.sample())
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_start_near_the_cube_touches_nothing_and_comes_after_a_failure_only(model):
+    task, usual = (PickTask(64, robot_model=model) for _ in range(2))
+    ids = np.arange(64)
+    task.near_starts, task.held[::2] = 1.0, HOLD_STEPS
+    starts = [one.sample_initial(ids, [np.random.default_rng(seed) for seed in ids]) for one in (task, usual)]
+    near, far = (start.signals["joint_position"] for start in starts)
+    pose = starts[0].signals["object_pose"]
+    np.testing.assert_array_equal(pose, starts[1].signals["object_pose"])
+    np.testing.assert_array_equal(starts[0].seeds, starts[1].seeds)
+    np.testing.assert_array_equal(near[::2], far[::2])
+    offset = task.arm.tool_pose(near)[0][1::2] - np.column_stack([pose[1::2, :2], np.full(32, task.table.edge / 2)])
+    up, away = offset[:, 2] / task.table.edge, np.hypot(offset[:, 0], offset[:, 1]) / task.table.edge
+    assert (up > -0.05).all()
+    assert (up < 2.55).all()
+    assert (away < 4.05).all()
+    assert up.max() > 1.5
+    assert away.max() > 1.5
+    assert (up[(away > 0.3) & (away < 2.2)] > 0.8).all()
+    robot = SimulatedArm(64, robot_model=model)
+    robot.connect()
+    state = robot.reset(ids, starts[0])
+    for _ in range(3):
+        state = robot.step(state.command)
+    np.testing.assert_allclose(state.signals["object_position"][:, :2], pose[:, :2], atol=5e-4)
+    robot.close()
+
+
+@pytest.mark.parametrize("kind", [PickTask, PickPlaceTask])
+@pytest.mark.parametrize("model", ["ur5e", "fr3", "so101"])
+def test_left_and_right_exchanged_a_cube_task_is_the_same(kind, model):
+    task, robot, ids, left = kind(2, robot_model=model), SimulatedArm(2, robot_model=model), np.arange(2), [1, -1]
+    table = task.table
+    x, _, z = table.start_area.mean(axis=0)
+    y, cube = 0.8 * table.start_area[1, 1], 0.8 * table.cube_area[1, 1]
+    joints = task.arm.reach_down(np.array([[x, y * side, z] for side in left]), 0.3 * np.array(left))
+    pose = np.array([[x, cube * side, 0.7 * side] for side in left])
+    robot.connect()
+    state = robot.reset(ids, Initial({"joint_position": joints, "object_pose": pose}, np.zeros(2, np.int64)))
+    if kind is PickPlaceTask:
+        task.goal = np.array([[x, -0.5 * cube * side] for side in left])
+    task.on_reset(ids, state)
+    seen, acted = (
+        np.array([-1 if one.name in task.mirrored else 1 for one in labels])
+        for labels in (task.observation_labels, task.action_labels)
+    )
+    action = np.linspace(-0.5, 0.8, len(acted))
+    for step in range(8):
+        one, image = task.observe(state)
+        np.testing.assert_allclose(image, one * seen, atol=0.3 if step else 0.03)  # joints have no image
+        actions = np.stack([action, action * acted]).astype(np.float32)
+        state = robot.step(task.command(actions, state))
+        assert np.ptp(task.score(state, actions).reward) < 1e-3
+    moved = [name for name in ("target_dy", "target_dyaw") if name in names(task.observation_labels)]
+    columns = [names(task.observation_labels).index(name) for name in moved]
+    assert (task.observe(state)[0, columns] * task.observe(state)[1, columns] < 0).all()
+    robot.close()

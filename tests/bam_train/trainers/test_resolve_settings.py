@@ -76,6 +76,14 @@ def test_a_preset_has_coarse_physics_for_the_usual_environment_only():
     assert not resolve({**given, "coarse_physics": False}).coarse_physics
 
 
+def test_a_preset_has_mirror_images_where_the_observation_is_the_usual_one():
+    given = {"env": "bam/pick", "algo": "ppo"}
+    for others in ({}, {"robot_model": "fr3"}, {"randomize": True}):
+        assert resolve({**given, "env_kwargs": others}).mirror
+    assert not resolve({**given, "env_kwargs": {"link": "wifi"}}).mirror
+    assert not resolve({**given, "mirror": False}).mirror
+
+
 def test_there_are_as_many_environments_as_the_servers_have():
     with TcpServer(EnvServer(gym.make_vec("bam/reach-v0", num_envs=2))) as server:
         given = {"env": "bam/reach", "algo": "ppo", "transport": [server.url]}

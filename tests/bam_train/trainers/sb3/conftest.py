@@ -98,9 +98,9 @@ def walk(monkeypatch):
 
     real = vec_env.make_training_env
 
-    def make(env_id, env_kwargs, num_envs, place, coarse):
+    def make(env_id, env_kwargs, num_envs, place, coarse, near):
         if isinstance(place, Remote) or env_id != "test/Walk-v0":
-            return real(env_id, env_kwargs, num_envs, place, coarse=coarse)
+            return real(env_id, env_kwargs, num_envs, place, coarse=coarse, near=near)
         return vec_env.BatchVecEnv(Walk(num_envs, **env_kwargs))
 
     monkeypatch.setattr(trainer_module, "make_training_env", make)
