@@ -50,9 +50,10 @@ noise = torch.randn(1, 8, 6, generator=torch.Generator().manual_seed(0))
 for part in (policy, pre, post):
     part.save_pretrained(folder / "pretrained_model")
 saved = folder / "pretrained_model" / "config.json"
+config_text = saved.read_text()
 if kind == "act":  # as LeRobot's default, which would be downloaded
     weights = {"pretrained_backbone_weights": "ResNet18_Weights.IMAGENET1K_V1"}
-    saved.write_text(json.dumps(json.loads(saved.read_text()) | weights))
+    saved.write_text(json.dumps(json.loads(config_text) | weights))
 (folder / "data" / "meta").mkdir(parents=True)
 features = {name: {"names": NAMES} for name in (state, "action")}
 (folder / "data" / "meta" / "info.json").write_text(json.dumps({"fps": 20, "features": features}))
@@ -64,6 +65,7 @@ try:
 except SystemExit as done:
     if done.code:
         raise
+saved.write_text(config_text)
 frozen, worst = FrozenPolicy.load(folder / "act.zip"), 0.0
 scale = np.array([0.05 / 100, *[np.pi / 180] * 5])
 for _ in range(100):

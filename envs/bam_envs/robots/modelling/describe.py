@@ -60,6 +60,9 @@ def describe(
     reach = float(np.linalg.norm(read.placements[:, :3, 3], axis=1).sum())
     if not 0.15 < reach < _FARTHEST:
         raise InvalidValue(f"{model}: the arm is {reach:.3g} m long; are its lengths in metres?")
+    size = max(float(np.abs(points).max(initial=0.0)) for points in read.points)
+    if size > _FARTHEST:
+        raise InvalidValue(f"{model}: a shape reaches {size:.3g} m from its joint; are its lengths in metres?")
     joints = joint_rows(read)
     for row in joints:
         check_fields(row, lambda key, row=row: f"{model}: {row.name}: {key}")  # type: ignore[misc]

@@ -213,6 +213,9 @@ def _urdf(path: Path, folder: str) -> tuple[str, dict[str, tuple[float | None, f
     limits = {}
     for joint in root.findall("joint"):
         limit, name = joint.find("limit"), joint.get("name", "")
+        if joint.get("type") == "revolute" and (limit is None or not {"lower", "upper"} & {*limit.keys()}):
+            remedy = "give it lower and upper [rad], or the type continuous if it turns without end"
+            raise InvalidValue(f"{path}: {name} is revolute and has no position limits: {remedy}.")
         if limit is not None:
             low, high, *given = (_number(path, name, limit, key) for key in ("lower", "upper", "velocity", "effort"))
             if low > high:
@@ -241,7 +244,7 @@ def _parsed(text: str) -> ElementTree.Element:
 
 
 def _check_names(path: Path, root: ElementTree.Element) -> None:
-    """Refuse names that come twice, and those of links and joints that are not there, which MuJoCo does not tell."""
+    """Refuse names that come twice or are not there, and closed loops, none of which MuJoCo tells."""
     names = {kind: [one.get("name", "") for one in root.findall(kind)] for kind in ("link", "joint")}
     for kind, found in names.items():
         if twice := [name for name in found if found.count(name) > 1 or not name]:
@@ -252,6 +255,12 @@ def _check_names(path: Path, root: ElementTree.Element) -> None:
             if name is not None and name not in names[kind]:
                 hint = did_you_mean(name, names[kind])
                 raise InvalidValue(f"{path}: {joint.get('name')}: its {part} {name!r} is no {kind} of the file. {hint}")
+    held: dict[str, str | None] = {}
+    for joint in root.findall("joint"):
+        link, name = joint.find("child").get("link", ""), joint.get("name")  # type: ignore[union-attr]
+        if (other := held.setdefault(link, name)) != name:
+            loop = "a closed loop, and only trees of links are read"
+            raise InvalidValue(f"{path}: the link {link!r} hangs on the joints {other} and {name}: {loop}.")
 
 
 def _number(path: Path, joint: str, limit: ElementTree.Element, key: str) -> float:

@@ -20,6 +20,9 @@ from tests.bam_envs.making import solved
 HALF = np.pi / 2
 
 
+LOOP = '<joint name="rod" type="fixed"><parent link="shoulder"/><child link="fore"/></joint>'
+
+
 def six_joints():
     """An URDF of cylinders and boxes, with the lengths of a UR5e."""
     box, short = '<box size="0.05 0.05 0.08"/>', '<cylinder radius="0.03" length="0.03"/>'
@@ -334,6 +337,19 @@ def scaled(text, factor):
             NEEDS_LIMITS,
         ),
         (re.sub(r' range="[^"]*"', "", seven_joints()), GRIPPER, None, NEEDS_LIMITS),
+        (
+            re.sub(r'(name="elbow".*?)<limit[^>]*>', r'\1<limit effort="9" velocity="1"/>', six_joints(), flags=re.S),
+            GRIPPER,
+            None,
+            "{}: elbow is revolute and has no position limits: give it lower and upper [rad], or the type continuous "
+            "if it turns without end.",
+        ),
+        (
+            six_joints().replace('<link name="tool0"/>', '<link name="tool0"/>' + LOOP),
+            GRIPPER,
+            None,
+            "{}: the link 'fore' hangs on the joints elbow and rod: a closed loop, and only trees of links are read.",
+        ),
         (six_joints(), GRIPPER, "tol0", "Unknown link 'tol0'. Did you mean 'tool0'?"),
         (
             "<mujoco><worldbody>"
@@ -374,6 +390,12 @@ def scaled(text, factor):
             "{}: its gripper does not open. Give --gripper parallel:WIDTH instead.",
         ),
         (scaled(six_joints(), 1000), GRIPPER, None, "{}: the arm is 1.2e+03 m long; are its lengths in metres?"),
+        (
+            six_joints().replace('radius="0.04" length="0.08"', 'radius="40" length="80"'),
+            GRIPPER,
+            None,
+            "{}: a shape reaches 40 m from its joint; are its lengths in metres?",
+        ),
         (
             six_joints().replace('<mass value="2"/>', '<mass value="1e9"/>'),
             GRIPPER,
