@@ -42,12 +42,19 @@ class Plan:
         shape: Of an action.
         fade: Greatest change of each number of an action in a step that a change-over may add, of this shape; None:
             change-overs do not fade.
+        slow: What is too slow where a chunk is late.
     """
 
-    def __init__(self, chunk: Chunk | None, shape: tuple[int, ...], fade: Array | None = None) -> None:
+    def __init__(
+        self,
+        chunk: Chunk | None,
+        shape: tuple[int, ...],
+        fade: Array | None = None,
+        slow: str = "The policy is too slow for this computer",
+    ) -> None:
         if chunk is None:
             raise PolicyError(f"the policy: {ONE_BY_ONE}")
-        self.chunk, self._shape, self._fade = chunk, shape, fade
+        self.chunk, self._shape, self._fade, self._slow = chunk, shape, fade, slow
         self.step = 0
         """Steps executed so far."""
         self.tick = 0
@@ -115,8 +122,7 @@ class Plan:
         if not found:
             last = f"the last one was for step {self._answers[-1].begun}" if self._answers else "none came"
             raise LateChunk(
-                f"no chunk has an action for step {self.step}: {last}, of {self.chunk.size} actions. The policy is too "
-                "slow for this computer"
+                f"no chunk has an action for step {self.step}: {last}, of {self.chunk.size} actions. {self._slow}"
             )
         values = np.stack([self._value(one, self.step) for one in found])
         self.step, self.tick = self.step + 1, self.tick + 1

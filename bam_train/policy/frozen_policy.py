@@ -256,7 +256,7 @@ class FrozenPolicy:
 
     def plan(self, fade: np.ndarray | None = None) -> Plan:
         """A new plan of the actions of one environment; for `fade`, see `Plan`."""
-        return Plan(self.chunk, self._action.shape, fade)
+        return Plan(self.chunk, self._action.shape, fade, self._session.slow)
 
     def checked(self, observation: Any) -> dict[str, np.ndarray]:
         """One observation as arrays by the names of the graph's inputs, without a batch axis, copied."""

@@ -51,7 +51,10 @@ class OnnxSession:
         inputs: Its inputs, by name.
         outputs: Names of its outputs.
         most_seconds: Most CPU time for the first run [s].
+        slow: What to say of a late chunk.
     """
+
+    slow = "The policy is too slow for this computer"
 
     def __init__(self, onnx: bytes, threads: int = 1) -> None:
         try:

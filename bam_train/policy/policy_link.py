@@ -53,6 +53,11 @@ class PolicyLink:
     def __str__(self) -> str:
         return f"policy server {self._url}"
 
+    @property
+    def slow(self) -> str:
+        """What to say of a late chunk."""
+        return f"The {self}, or the link to it, is too slow"
+
     def wait_at_most(self, seconds: float) -> None:
         """Wait at most so long [s] for an answer from now on, since a robot moves."""
         self._transport.timeout = seconds

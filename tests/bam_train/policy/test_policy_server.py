@@ -13,7 +13,7 @@ from bam_envs.core.errors import LinkLost, NoServer
 from bam_envs.core.location import Credentials
 from bam_train.checkpoint import safetensors_file, write_checkpoint
 from bam_train.checkpoint.manifest import Chunk
-from bam_train.errors import PolicyError
+from bam_train.errors import LateChunk, PolicyError
 from bam_train.policy import FrozenPolicy
 from bam_train.policy.background import Background
 from bam_train.policy.chunks import Plan
@@ -30,6 +30,9 @@ def test_a_server_gives_the_actions_that_the_policy_gives_here(served, which):
     with served(ServedPolicy(chunked(CHUNK))) as urls:
         there = FrozenPolicy(PolicyLink(urls[which]), BOX1, BOX1, CHUNK)
         assert acts(there, 1, 2, 3, 4, 5) == acts(chunked(CHUNK), 1, 2, 3, 4, 5) == [101, 101.1, 203, 203.1, 405]
+        slow = rf"none came, of 4 actions\. The policy server {urls[which]}, or the link to it, is too slow$"
+        with pytest.raises(LateChunk, match=slow):
+            there.plan().take()
 
 
 def test_images_cross_both_transports(served):
