@@ -226,7 +226,7 @@ def write_profile(config: ProfileConfig) -> None:
     from bam_envs.arms.description import ArmDescription
     from bam_envs.core.robot_models import Description, find_model
     from bam_envs.robots.base_description import base_model
-    from bam_envs.robots.profile import profile_for, read_profile
+    from bam_envs.robots.profile import described_spec, profile_for, read_profile
     from bam_train.cli.arms.base_graph import BaseGraphProfile
     from bam_train.cli.arms.live_graph import GraphProfile, profile_toml
     from bam_train.cli.arms.rosetta_contract import contract_text
@@ -255,8 +255,7 @@ def write_profile(config: ProfileConfig) -> None:
     elif config.rosetta is None:
         raise InvalidValue("Where is the robot? Give its address or a contract with --from, or --rosetta FILE.")
     else:
-        spec = robot.spec(with_object=False) if isinstance(robot, ArmDescription) else base_model(robot).spec()
-        profile = profile_for(spec)
+        profile = profile_for(described_spec(robot))
     if config.rosetta is not None:
         Place(config.rosetta).write(contract_text(profile).encode())
         tell(f"wrote {config.rosetta}: a contract of rosetta")

@@ -30,10 +30,10 @@ CONTRACT, DESCRIPTION = "contract", "description"
 def examine(config: DoctorConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags; returns the exit status, also 1 if --measure wrote no file."""
     _require_valid(config)
-    from bam_envs.arms.description import robot_model
     from bam_envs.core.location import LiveRobot, serving
     from bam_envs.live.diagnosis import STEPS, Diagnosis
-    from bam_envs.robots.profile import fitting_profile, profile_for
+    from bam_envs.robots.profile import described_spec, fitting_profile, profile_for
+    from bam_envs.safety.guard import is_base
 
     place = LiveRobot(config.url, config.credentials, config.profile)
     contracts: list[Contract] = []  # one, once it was checked
@@ -46,9 +46,10 @@ def examine(config: DoctorConfig, signals: SignalMemory) -> int:
             place = replace(place, stand_in=serving(env.spec.id, env.spec.kwargs.get("robot_model")))
             more = [(CONTRACT, lambda inspection: _contract(checkpoint, env, inspection, contracts))]
         elif config.robot_model is not None:
-            spec, named = robot_model(config.robot_model).spec(with_object=False), config.profile
+            spec, named = described_spec(config.robot_model), config.profile
             place = replace(place, profile=profile_for(spec) if named is None else fitting_profile(named, spec))
-            place = replace(place, stand_in=serving("bam/pick", config.robot_model))
+            task = "bam/navigation" if is_base(spec) else "bam/pick"
+            place = replace(place, stand_in=serving(task, config.robot_model))
         diagnosis = Diagnosis(place, robot, seconds=config.seconds)
         opened.callback(diagnosis.close)
         steps: list[DiagnosisStep] = []
@@ -98,17 +99,18 @@ def _description(config: DoctorConfig, inspection: Inspection, contracts: list[C
 
     None for a base, and for a Universal Robots arm that no flag names: all of them have one profile.
     """
-    from bam_envs.arms.description import ArmDescription, robot_model
-    from bam_envs.core.robot_models import known_models
+    from bam_envs.arms.description import ArmDescription
+    from bam_envs.core.robot_models import Description, find_model, known_models
     from bam_envs.live.arm_checks import described_checks
     from bam_envs.live.building import profile_limits
     from bam_train.deploy.contract import Contract
 
     profile = inspection.profile
-    name = config.robot_model or (profile.robot if profile.robot in known_models(ArmDescription) else "")
-    if not name or (config.robot_model is None and robot_model(name).geometry):
+    name = config.robot_model or (profile.robot if profile.robot in known_models() else "")
+    arm = find_model(name, Description) if name else None
+    if not isinstance(arm, ArmDescription) or (config.robot_model is None and arm.geometry):
         return None
-    arm, margin = robot_model(name), profile_limits(profile).position_margin
+    margin = profile_limits(profile).position_margin
     checks = described_checks(arm.spec(with_object=False), arm.chain, margin, inspection)
     return _required(Contract(tuple(checks), inspection), f"the description of {arm.name}", contracts)
 

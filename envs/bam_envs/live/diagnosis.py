@@ -15,9 +15,11 @@ import numpy as np
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady, ProtocolError, StaleState
 from bam_envs.core.location import LiveRobot, is_loopback
+from bam_envs.core.robot_models import known_models
 from bam_envs.live import bringup
 from bam_envs.live.building import live_robot, require_robot_address
 from bam_envs.live.examination import PING_TOPIC, Array, Inspection, Reading, inspect_robot
+from bam_envs.robots.base_description import BaseDescription, base_model
 from bam_envs.robots.profile import load_profile, own_profile, profile_for, shipped_profiles
 from bam_envs.ros.profile_tables import RobotProfile
 from bam_envs.rosbridge.bus import namespaces_with
@@ -139,6 +141,8 @@ class Diagnosis:
             found.append(f"the robot describes itself: {info.text or info.name}")
             if self.profile is None and own_profile(info.name) is not None:
                 self.profile = load_profile(info.name)
+            elif self.profile is None and info.name in known_models(BaseDescription):
+                self.profile = profile_for(base_model(info.name).spec())
         return found, []
 
     # ---- states

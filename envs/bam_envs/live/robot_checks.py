@@ -213,8 +213,9 @@ def _speed(speed: Reading, position: Reading, simulated: bool) -> Check:
     if still:
         return Check(what, expected, "not shown at rest", fits=None)
     found = f"{measured[worst]:.3g} measured, {changed[worst]:.3g} from {name}"
-    slower = float(measured @ changed / (changed @ changed))
-    if simulated and slower > 1 + RATE_OFF and (np.abs(measured - slower * changed) <= RATE_OFF * slower).all():
+    slower = float(measured @ changed / max(changed @ changed, RATE_OFF**2))
+    near = np.abs(measured - slower * changed) <= RATE_OFF * (1 + np.abs(measured))
+    if simulated and slower > 1 + RATE_OFF and near.all():
         found = f"{slower:.1f} times as fast as {name} changes: the simulation's computer is busy"
         return Check(what, expected, found, fits=None)
     return Check(what, expected, found, fits=bool(off[worst] <= RATE_OFF))

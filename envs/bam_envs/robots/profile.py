@@ -176,6 +176,12 @@ def profile_for(spec: RobotSpec) -> RobotProfile:
     raise InvalidValue(f"No shipped profile takes the commands of {spec.name}. Give its file: profile='my_robot.toml'.")
 
 
+def described_spec(name: Any, *, with_object: bool = False) -> RobotSpec:
+    """The signals of a described arm, with those of an object or without, or of a described base."""
+    robot = find_model(name, Description)
+    return robot.spec(with_object=with_object) if isinstance(robot, ArmDescription) else base_model(robot).spec()
+
+
 def own_profile(name: str) -> Any:
     """The file ``profiles/NAME.toml`` in the first folder of robot descriptions that has one, or None."""
     files = (folder / "profiles" / f"{name}.toml" for folder in description_folders())
@@ -422,8 +428,7 @@ def _named_robot(where: str, name: str) -> RobotSpec:
     if name in _ROBOTS:
         return _ROBOTS[name]()
     _require_known(where, "robot", [name], {*_ROBOTS, *known_models()})
-    robot = find_model(name, Description)
-    return robot.spec(with_object=True) if isinstance(robot, ArmDescription) else base_model(robot).spec()
+    return described_spec(name, with_object=True)
 
 
 def _signal(row: Table, where: str) -> SignalSpec:

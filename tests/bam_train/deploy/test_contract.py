@@ -50,7 +50,8 @@ class Watched:
     def contract(self):
         robot = SimpleNamespace(spec=self.spec, limits=Limits())
         env = SimpleNamespace(unwrapped=SimpleNamespace(robot=robot, task=self.task))
-        return Contract(tuple(live_checks(env, self.inspection())))
+        inspection = self.inspection()
+        return Contract(tuple(live_checks(env, inspection)), inspection)
 
     def inspection(self):
         names = {signal.name for signal in self.spec.signals} | {*TOOL_POSE}
