@@ -75,9 +75,9 @@ def environment_of(
 def must_be_named(env_id: str) -> bool:
     """Whether an id has a module that no installed package registers: it is imported only if the user names it."""
     module = env_id.rpartition(":")[0]
-    installed = {point.module for point in metadata.entry_points(group=ENTRY_POINTS)}
-    is_trusted = module.partition(".")[0] in ("bam_envs", "bam_train", "gymnasium")
-    return bool(module) and not is_trusted and module not in installed
+    if not module or module.partition(".")[0] in ("bam_envs", "bam_train", "gymnasium"):
+        return False
+    return module not in {point.module for point in metadata.entry_points(group=ENTRY_POINTS)}
 
 
 def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:

@@ -141,9 +141,14 @@ def description_folders() -> Iterator[Any]:
     """The folders that are searched, in order: the project's, this user's, those of packages, the shipped one."""
     yield Path("robots")
     yield config_folder() / "robots"
-    for point in metadata.entry_points(group=ENTRY_POINTS):
-        yield resources.files(point.value)
+    yield from _packaged(tuple(sys.path))
     yield SHIPPED
+
+
+@lru_cache(maxsize=1)
+def _packaged(path: tuple[str, ...]) -> list[Any]:
+    """The folders of packages on the `path` of Python, which has to read every package's metadata for them."""
+    return [resources.files(point.value) for point in metadata.entry_points(group=ENTRY_POINTS)]
 
 
 def known_models(kind: type[Description] = Description) -> dict[str, Any]:
