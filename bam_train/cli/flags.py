@@ -495,7 +495,7 @@ class ServeConfig(CredentialFlags, RobotModelFlag):
 
     # The fields of bam_envs.remote.ServeOptions:
     port: Annotated[Port | None, tyro.conf.arg(metavar="PORT")] = None
-    """Port of the rosbridge server, 0 for a free one; 9090 by default, and with --tcp alone there is none."""
+    """Port of the rosbridge server, 0 for a free one; 9090 by default, but none for a policy with --tcp alone."""
     bind: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen on; 127.0.0.1 is this computer alone, 0.0.0.0 every network it is in."""
     name: Annotated[str, tyro.conf.arg(metavar="NAME")] = ""
@@ -503,7 +503,7 @@ class ServeConfig(CredentialFlags, RobotModelFlag):
     namespace: Annotated[str, tyro.conf.arg(metavar="NAME")] = ""
     """Name before every topic and service, such as bam_001."""
     tcp: Annotated[Port | None, tyro.conf.arg(metavar="PORT")] = None
-    """Serve the environment on this TCP port, which is faster; 0 takes a free one."""
+    """Serve the environment on this TCP port too, which is faster; 0 takes a free one."""
     via: Url = None
     """Offer everything through the rosbridge server at this address (ws://10.0.0.5:9090) instead of one here."""
     rclpy: bool = False

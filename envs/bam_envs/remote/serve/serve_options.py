@@ -23,7 +23,7 @@ class ServeOptions(Credentials):
     """
 
     port: Port | None = None
-    """Port of the rosbridge server, 0 for a free one; 9090 by default, and with --tcp alone there is none."""
+    """Port of the rosbridge server, 0 for a free one; 9090 by default, but none for a policy with --tcp alone."""
     bind: str = "127.0.0.1"
     """Address to listen on; 127.0.0.1 is this computer only, 0.0.0.0 all its networks."""
     namespace: str = ""
@@ -31,7 +31,7 @@ class ServeOptions(Credentials):
     name: RobotName = ""
     """Name that the robot tells its clients, to tell it from others: trials count for the robot of that name."""
     tcp: Port | None = None
-    """Serve the environment on this TCP port, which is faster; 0 takes a free one."""
+    """Serve the environment on this TCP port too, which is faster; 0 takes a free one."""
     via: str | None = None
     """Offer everything through the rosbridge server at this address (ws://10.0.0.5:9090) instead of a new one."""
     rclpy: bool = False

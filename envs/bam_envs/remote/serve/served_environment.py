@@ -62,7 +62,7 @@ class ServedEnvironment:
         self.lease = CommandLease(options.lease)
         """The lease on command."""
         self.bus: Bus | None = None
-        """The bus for topics and services; None if the TCP transport alone is asked for."""
+        """The bus for topics and services; None for a policy if the TCP transport alone is asked for."""
         self.tcp: TcpServer | None = None
         """The TCP transport, if there is one."""
         self._tell, self._stack, self._paced = tell, ExitStack(), paced
@@ -95,7 +95,6 @@ class ServedEnvironment:
     def _start(self, started: ExitStack) -> None:
         options, profile = self.options, _profile_of(self.env)
         realtime = options.realtime or (profile is not None and not options.fast)
-        profile = profile if options.has_topics else None
         if options.name and profile is None:
             raise InvalidValue("--name is the name of a robot, and no robot is served here; leave it out.")
         robot = None if profile is None else _take_robot(self.env, profile, realtime)
@@ -108,7 +107,7 @@ class ServedEnvironment:
             self._tell(options.warning)
         served_as = getattr(self.env, "served_as", "")
         name = served_as or server.spec().env_id
-        if options.has_topics:
+        if options.has_topics or not served_as:
             self.bus = bus = self._open_bus(started)
             if robot is not None and profile is not None:
                 self._serve_robot(robot, profile, bus, started)

@@ -85,17 +85,6 @@ def test_an_environment_without_a_robot_has_no_topics(serve_env, transport):
     np.testing.assert_array_equal(observation, gym.make("CartPole-v1").reset(seed=3)[0])
 
 
-def test_the_tcp_port_alone(serve_env, transport):
-    served = serve_env(port=None, tcp=0)
-    assert (served.bus, served.robot_service) == (None, None)
-    assert served.endpoints == [f"bam/pick-v0 on {served.tcp.url}, the environment alone"]
-    remote = transport(TcpTransport, served.tcp.url)
-    remote.reset(5)
-    remote.step(RISE)
-    with pytest.raises(InvalidValue, match=r"^--name is the name of a robot, and no robot is served here; leave it"):
-        serve_env(port=None, tcp=0, name="arm")
-
-
 def test_a_robot_is_looked_for_where_none_is(serve_env, link):
     served = serve_env("CartPole-v1")
     text = (
