@@ -81,8 +81,9 @@ def test_a_policy_server_is_behind_the_same_link(run, served, chunk_checkpoint, 
         report = json.loads(out)
         assert (status, report["stopped_by"]) == (0, {})
         assert [(one["end"], one["length"]) for one in report["per_episode"]] == [(end, min(size, 600))]
-    late = "no chunk has an action for step 3: the last one was for step 0, of 3 actions. The policy is too slow for "
-    assert err == f"bam-deploy: episode with seed 1000000: {late}this computer\n"
+    late = "no chunk has an action for step 3: the last one was for step 0, of 3 actions"
+    slow = f"The policy server {urls[1]}, or the link to it, is too slow"
+    assert err == f"bam-deploy: episode with seed 1000000: {late}. {slow}\n"
 
 
 def test_it_adds_the_link_only():
