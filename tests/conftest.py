@@ -74,6 +74,8 @@ KINDS = {
         "bam_train/files/test_place.py",
         "bam_train/compat/bbrl",
         "bam_train/play",
+        "bam_train/estimation",
+        "bam_envs/rosbridge/test_client_faults.py",
         "bam_train/test_detector.py",
         "bam_envs/safety/test_any_arm.py",
         "bam_envs/core/test_robot_vector_env.py",
