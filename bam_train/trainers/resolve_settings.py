@@ -85,7 +85,8 @@ def resolve(given: Mapping[str, Any], tell: Tell = lambda text: None) -> TrainSe
     preset = read_preset(env, asked.algo, asked.trainer)
     if asked.env_kwargs:  # other arms learn less on it, and a link sends in the middle of a period
         preset.pop("coarse_physics", None)
-    if asked.env_kwargs.keys() - {"robot_model", "randomize"}:  # observed otherwise, such as with cameras
+    is_usual = asked.env_kwargs.keys() <= {"robot_model", "randomize"} and not run.get("normalize")
+    if not is_usual:  # it observes other numbers, such as with cameras
         preset.pop("mirror", None)
     usual = {"steps": OFFLINE_STEPS} if asked.trainer == "offline" else {}
     tuned = preset.pop("hyperparameters", {})

@@ -294,7 +294,7 @@ class RunnerWatch:
         self._deaths: dict[int, deque[int]] = {index: deque(maxlen=MOST_DEATHS + 1) for index in self._all}
         self._update = 0
         self._seen_at = clock()
-        self._cause = ""
+        self._causes: dict[int, str] = {}  # the last one known of each runner, in brackets
         self._lines: list[str] = []
         if self._all:
             self._rllibs_restore = algorithm.restore_env_runners
@@ -331,7 +331,8 @@ class RunnerWatch:
         if self._gone < self._all:
             self._seen_at = now
         elif (waited := now - self._seen_at) > LONGEST_ALONE:
-            text = f"all {len(self._all)} env runners died{self._cause}, and none came back in {waited:.0f} s"
+            why = next(reversed(self._causes.values()), "")
+            text = f"all {len(self._all)} env runners died{why}, and none came back in {waited:.0f} s"
             raise TrainingFailed(text, is_kept=True)
         return back
 
@@ -342,17 +343,16 @@ class RunnerWatch:
             return
         self._gone |= died
         for index in sorted(died):
-            why = self._cause_of(index)
-            self._cause = f" ({why})" if why else ""
-            self._lines.append(f"env runner {index} died{self._cause}: what it had not delivered yet is lost")
+            why = f" ({cause})" if (cause := self._cause_of(index)) else ""
+            self._causes |= {index: why} if why else {}
+            self._lines.append(f"env runner {index} died{why}: what it had not delivered yet is lost")
             deaths = self._deaths[index]
             deaths.append(self._update)
             updates = self._update - deaths[0] + 1
             if len(deaths) > MOST_DEATHS and updates <= WINDOW:
                 within = f"{updates} update{'s' if updates > 1 else ''}"
-                raise TrainingFailed(
-                    f"env runner {index} died {len(deaths)} times within {within}{self._cause}", is_kept=True
-                )
+                text = f"env runner {index} died {len(deaths)} times within {within}{self._causes.get(index, '')}"
+                raise TrainingFailed(text, is_kept=True)
         left = len(self._all) - len(self._gone)
         goes_on = f"training goes on with {left} of {len(self._all)} env runners"
         self._lines.append(goes_on if left else "no env runner is left: waiting for one to come back")

@@ -82,6 +82,8 @@ def test_a_preset_has_mirror_images_where_the_observation_is_the_usual_one():
         assert resolve({**given, "env_kwargs": others}).mirror
     assert not resolve({**given, "env_kwargs": {"link": "wifi"}}).mirror
     assert not resolve({**given, "mirror": False}).mirror
+    for normalize, mirror in ((False, True), (True, False), ({"norm_obs": False}, False)):
+        assert resolve({**given, "normalize": normalize}).mirror is mirror
 
 
 def test_there_are_as_many_environments_as_the_servers_have():

@@ -116,6 +116,16 @@ def test_one_dies_again_and_again():
     assert str(caught.value) == "env runner 2 died 6 times within 6 updates (RuntimeError: out of licences)"
 
 
+def test_the_cause_is_told_that_one_of_the_deaths_had():
+    """Ray may report a death without the last words of the process."""
+    watch = watched(Algorithm([[([2], [2])]] * 6), {2: "RuntimeError: out of licences"})
+    lines = [watch.train()[1][0] for _ in range(5)]
+    assert [" (RuntimeError: out of licences)" in line for line in lines] == [True, *[False] * 4]
+    with pytest.raises(TrainingFailed) as caught:
+        watch.train()
+    assert str(caught.value) == "env runner 2 died 6 times within 6 updates (RuntimeError: out of licences)"
+
+
 def test_rare_deaths_and_deaths_of_many_are_borne():
     watch = watched(Algorithm([[([2], [2])] if step % 5 == 0 else QUIET for step in range(60)]))
     for _ in range(60):
