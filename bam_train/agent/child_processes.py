@@ -49,8 +49,8 @@ def favour_session(pid: int) -> None:
     """
     group = Path(f"/proc/{pid}/autogroup")
     with suppress(AttributeError, OSError):
-        if (niceness := os.getpriority(os.PRIO_PROCESS, 0)) < 0:
-            before = group.read_text().rpartition(" ")[2].strip()
+        before = group.read_text().rpartition(" ")[2].strip()  # nothing where Linux does not share it so
+        if before and (niceness := os.getpriority(os.PRIO_PROCESS, 0)) < 0:
             group.write_text(str(niceness))
             atexit.register(_restore, group, before)
 
