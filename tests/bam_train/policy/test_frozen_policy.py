@@ -341,15 +341,18 @@ def test_many_policies_may_run_in_many_threads(save: Any):
     assert max(worst) < 1e-6
 
 
-def test_a_policy_runs_where_only_onnxruntime_is_imported(save: Any):
+def test_a_policy_runs_where_only_onnxruntime_is_imported(save: Any, tmp_path: Path):
+    """And nothing of the computer is noted, for onnxruntime's maker or otherwise."""
     script = (
         "import sys, numpy as np; from bam_train.policy import FrozenPolicy; names = lambda: ' '.join(sys.modules)\n"
         "print(names()); print(FrozenPolicy.load(sys.argv[1]).act(np.ones(3)).tolist()); print(names())"
     )
-    environment = {"PYTHONPATH": os.pathsep.join(sys.path)}
+    (home := tmp_path / "home").mkdir()
+    environment = {"PYTHONPATH": os.pathsep.join(sys.path), "HOME": str(home), "TMPDIR": str(home)}
     command = [sys.executable, "-c", script, str(save())]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     imported, action, running = (line.split() for line in done.stdout.splitlines())
     assert action == ["[1.0,", "1.0]"]
     assert "onnxruntime" in set(running) - set(imported)
+    assert not [*home.rglob("*")]
     assert not {"torch", "gymnasium", "bam_envs", "onnx", "stable_baselines3", "cloudpickle", "tyro"} & set(running)
