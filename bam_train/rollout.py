@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from bam_envs.core.spaces import joined, leaves_by_path, part_at
-from bam_train.finite_envs import require_finite_action
+from bam_train.env_faults import require_finite_action
 
 Array = NDArray[Any]
 Parts = Callable[[Any, Array], tuple[Array, ...]]

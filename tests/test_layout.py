@@ -31,8 +31,7 @@ ORDER = {
             "errors",
             "signals",
             "settings",
-            "finite_envs",
-            "foreign_env",
+            "env_faults",
             "rollout",
         ),
         *(

@@ -20,8 +20,7 @@ from typing import IO, Any
 from bam_train.checkpoint import MANIFEST, POLICY, Checkpoint
 from bam_train.checkpoint.detector import Detector
 from bam_train.errors import CheckpointError, OutputError, RequestRefused, SettingsError
-from bam_train.files.atomic_file import remove_orphans, replacing
-from bam_train.files.locks import lock
+from bam_train.files.atomic_file import lock, remove_orphans, replacing
 from bam_train.policy import FrozenPolicy
 
 CHAMPION, CANDIDATE, PREVIOUS, GIVEN = "champion", "candidate", "previous", "given"

@@ -57,7 +57,7 @@ def evaluate_checkpoint(config: EvalConfig) -> None:
     from bam_train.compat.plain_sb3_zip import is_plain_sb3
     from bam_train.environments import make_env, make_vector_env, require_fit
     from bam_train.evaluation import default_num_envs, evaluate
-    from bam_train.files.video import picture, require_video_path
+    from bam_train.files.pictures import picture, require_video_path
 
     video = None if config.video is None else require_video_path(config.video)
     path = config.checkpoint.expanduser()
@@ -272,7 +272,7 @@ def _table(report: EvaluationReport, subject: _Subject, path: Path) -> list[str]
 def _record(config: EvalConfig, subject: _Subject, path: Path) -> None:
     from bam_train.environments import control_period, make_env
     from bam_train.evaluation import record_video
-    from bam_train.files.video import open_video
+    from bam_train.files.pictures import open_video
 
     episodes = min(config.video_episodes, config.episodes)
     env = make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")

@@ -17,7 +17,7 @@ from bam_train.cli.console import say_in_handler
 from bam_train.cli.flags import EnvId, File, Url
 from bam_train.deploy.deployment import Deployment
 from bam_train.deploy.journal import EpisodeRecord, Journal
-from bam_train.environments.made_env import with_live_robot
+from bam_train.environments import with_live_robot
 from bam_train.signals import SignalMemory, handled, interrupt
 
 

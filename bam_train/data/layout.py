@@ -30,7 +30,7 @@ from typing import IO, Any
 
 from bam_train.data.arrow_columns import Arrow
 from bam_train.errors import BadDataSet, NoSuchPlace, PlaceError
-from bam_train.files.locks import LOCKS, lock
+from bam_train.files.atomic_file import LOCKS, lock
 from bam_train.files.place import Place
 
 LOCK, MENDING = "meta/.writer", "meta/.mending"

@@ -20,10 +20,10 @@ from bam_envs.remote.wire.values import plain_info, tree_to_json
 from bam_train.checkpoint.manifest import WHERE
 from bam_train.data.data_set_writer import DataSetWriter
 from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, nested
+from bam_train.env_faults import TransparentVectorWrapper
 from bam_train.environments import AnyEnv, control_period
 from bam_train.errors import BadDataSet, SettingsError
 from bam_train.files.place import Place
-from bam_train.finite_envs import TransparentVectorWrapper
 from bam_train.rollout import last_observations
 
 Keep = Callable[[int, "int | None"], bool]

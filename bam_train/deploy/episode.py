@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from bam_envs.core.robot_env import robot_of
 from bam_envs.core.timing import Pacer, TickTimes
 from bam_train.deploy.journal import EpisodeRecord, Journal
+from bam_train.env_faults import require_finite_action
 from bam_train.errors import LoopError
-from bam_train.finite_envs import require_finite_action
 from bam_train.policy.background import Background
 
 OBSERVATION = "env_obs"

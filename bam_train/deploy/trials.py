@@ -33,7 +33,7 @@ from typing import IO, Any
 
 from bam_train.checkpoint.ownership import who_else
 from bam_train.errors import FormatError
-from bam_train.files.locks import lock
+from bam_train.files.atomic_file import lock
 
 ALPHA = 0.05
 """Maximum probability that a policy passes although its success rate is not above the threshold."""

@@ -18,6 +18,7 @@ import numpy as np
 
 from bam_train.checkpoint import Checkpoint
 from bam_train.data import DataSet
+from bam_train.env_faults import FiniteVectorEnv
 from bam_train.environments import (
     environment_of,
     first_difference,
@@ -41,7 +42,6 @@ from bam_train.estimation.estimates import Estimate
 from bam_train.estimation.fitted_q import fit_q
 from bam_train.estimation.steps import read_steps
 from bam_train.evaluation import default_num_envs, waves, wilson_interval
-from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.policy import FrozenPolicy
 from bam_train.rollout import PlayedEpisode
 

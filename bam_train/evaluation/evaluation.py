@@ -17,10 +17,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from bam_envs.core.validation import NonNegativeInt, PositiveInt, check
+from bam_train.env_faults import FiniteVectorEnv
 from bam_train.environments import is_batched, make_vector_env
 from bam_train.errors import SettingsError
-from bam_train.files.video import Frame, picture
-from bam_train.finite_envs import FiniteVectorEnv
+from bam_train.files.pictures import Frame, picture
 from bam_train.rollout import BatchPolicy, Parts, PlayedEpisode, rollout
 
 FIRST_SEED = 1_000_000
@@ -201,7 +201,7 @@ def record_video(env: gym.Env[Any, Any], policy: Any, add: Callable[[Frame], Any
     Args:
         env: Made with ``render_mode="rgb_array"``.
         policy: Has ``reset()`` and ``act(observation)``: a `FrozenPolicy`.
-        add: Called with each picture, such as the function that `bam_train.files.video.open_video` yields.
+        add: Called with each picture, such as the function that `bam_train.files.pictures.open_video` yields.
         episodes: Number of episodes.
         seed: Seed of the first episode.
 

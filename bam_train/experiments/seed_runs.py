@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bam_train.errors import SettingsError
-from bam_train.files.locks import locked
+from bam_train.files.atomic_file import locked
 from bam_train.settings import TrainSettings, file_stem
 from bam_train.signals import await_end, start_child
 from bam_train.trainers.run_folder import RunFolder, read_object

@@ -29,7 +29,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from bam_train.errors import OutputError, SettingsError
 from bam_train.experiments.search_space import SearchSpace
 from bam_train.experiments.seed_runs import SeedRun, what_is_learnt
-from bam_train.files.locks import LOCKS, locked
+from bam_train.files.atomic_file import LOCKS, locked
 from bam_train.settings import differences, file_stem
 from bam_train.trainers.run_folder import RunFolder, read_object, writing
 

@@ -1,8 +1,8 @@
-"""Files that are complete or absent, such as checkpoints and videos: written to a temporary file, then renamed.
+"""Files that are complete or absent, such as checkpoints and videos: written to a temporary file, then renamed; locks.
 
 The temporary file is locked while a process writes it: a process that is killed cannot remove its file, but the system
 releases its lock. A process id in the name would not be unique: computers and containers that share a folder use the
-same ids.
+same ids. Locks end with their process; on Windows there are none.
 """
 
 import contextlib
@@ -11,12 +11,54 @@ import re
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import IO
 
 from bam_train.errors import OutputError
-from bam_train.files.locks import LOCKS, lock
 
+try:
+    import fcntl
+except ImportError:
+    fcntl = None  # type: ignore[assignment]
+
+LOCKS = fcntl is not None
+"""Whether the system has locks."""
 REPLACED: list[Callable[[Path], None]] = []
 """Called with each file that `replacing` has replaced."""
+
+
+def lock(file: int | IO[bytes] | IO[str], *, wait: bool = True) -> None:
+    """Lock an open file or folder; without locks it does nothing.
+
+    Raises:
+        BlockingIOError: Another process has it, unless `wait`.
+        OSError: The file system has no locks.
+    """
+    if fcntl is not None:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+
+
+@contextlib.contextmanager
+def locked(folder: Path, wait: bool = False) -> Iterator[int | None]:
+    """Within the ``with`` block no other call has the lock of the folder; yields its descriptor.
+
+    Children that get the descriptor hold the lock as long as one of them lives.
+
+    Raises:
+        OutputError: Another process has it, unless `wait`.
+    """
+    if not LOCKS:
+        yield None
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            lock(descriptor, wait=wait)
+        except BlockingIOError as error:
+            text = "another program trains its seeds, or its runs are being saved. Wait for its end"
+            raise OutputError(f"{folder}: {text}", kind="FolderInUse") from error
+        yield descriptor
+    finally:
+        os.close(descriptor)
 
 
 def require_writable(path: Path) -> Path:

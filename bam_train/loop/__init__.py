@@ -10,28 +10,28 @@ The core needs NumPy only. Names that need torch, and names for programs written
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from bam_train.loop.agents.agent import Agent, import_torch
-from bam_train.loop.agents.agents import Agents, CopyTAgent, EpisodesDone, KWAgentWrapper, PrintAgent, SeedableAgent
-from bam_train.loop.agents.temporal_agent import TemporalAgent
+from bam_train.loop.agent import Agent, import_torch
+from bam_train.loop.agents import Agents, CopyTAgent, EpisodesDone, KWAgentWrapper, PrintAgent, SeedableAgent
+from bam_train.loop.temporal_agent import TemporalAgent
 from bam_train.loop.workspace.workspace import Workspace
 
 if TYPE_CHECKING:
-    from bam_train.loop.gym.gym_agent import GymAgent as GymAgent
-    from bam_train.loop.gym.parallel_gym_agent import ParallelGymAgent as ParallelGymAgent
-    from bam_train.loop.gym.parallel_gym_agent import make_env as make_env
-    from bam_train.loop.gym.parallel_gym_agent import record_video as record_video
-    from bam_train.loop.gym.robot_agent import ObservingAgents as ObservingAgents
-    from bam_train.loop.gym.robot_agent import PolicyAgent as PolicyAgent
-    from bam_train.loop.gym.robot_agent import RobotAgent as RobotAgent
-    from bam_train.loop.gym.vec_gym_agent import VecGymAgent as VecGymAgent
+    from bam_train.loop.gym_agent import GymAgent as GymAgent
+    from bam_train.loop.parallel_gym_agent import ParallelGymAgent as ParallelGymAgent
+    from bam_train.loop.parallel_gym_agent import make_env as make_env
+    from bam_train.loop.parallel_gym_agent import record_video as record_video
+    from bam_train.loop.robot_agent import ObservingAgents as ObservingAgents
+    from bam_train.loop.robot_agent import PolicyAgent as PolicyAgent
+    from bam_train.loop.robot_agent import RobotAgent as RobotAgent
+    from bam_train.loop.vec_gym_agent import VecGymAgent as VecGymAgent
     from bam_train.loop.workspace.replay_buffer import ReplayBuffer as ReplayBuffer
     from bam_train.loop.workspace.returns import gae as gae
 
 _ON_USE = {
-    "loop.gym.gym_agent": ("GymAgent",),
-    "loop.gym.parallel_gym_agent": ("ParallelGymAgent", "make_env", "record_video"),
-    "loop.gym.vec_gym_agent": ("VecGymAgent",),
-    "loop.gym.robot_agent": ("ObservingAgents", "PolicyAgent", "RobotAgent"),
+    "loop.gym_agent": ("GymAgent",),
+    "loop.parallel_gym_agent": ("ParallelGymAgent", "make_env", "record_video"),
+    "loop.vec_gym_agent": ("VecGymAgent",),
+    "loop.robot_agent": ("ObservingAgents", "PolicyAgent", "RobotAgent"),
     "loop.workspace.replay_buffer": ("ReplayBuffer",),
     "loop.workspace.returns": ("cumulated_reward", "doubleqlearning_temporal_difference", "gae", "temporal_difference"),
     "compat.bbrl.conventions": (

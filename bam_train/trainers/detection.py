@@ -16,9 +16,9 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.checkpoint import add_members
 from bam_train.checkpoint.detector import DETECTOR, LEAST_TICKS, MOST_NUMBERS, Detector, Rollout, make_detector, vectors
 from bam_train.data.recorded_episode import Episode
+from bam_train.env_faults import FiniteVectorEnv
 from bam_train.environments import make_vector_env
 from bam_train.errors import SettingsError
-from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.rollout import BatchPolicy, Parts, PlayedEpisode, rollout
 
 SEED = 4_000_000

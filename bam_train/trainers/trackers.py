@@ -21,7 +21,7 @@ from typing import Any, Protocol
 
 from bam_envs.core.wording import did_you_mean
 from bam_train.errors import OutputError, SettingsError
-from bam_train.files.locks import locked
+from bam_train.files.atomic_file import locked
 from bam_train.settings import TrainSettings, walk
 from bam_train.trainers.run_folder import TRACKED, RunFolder, read_object, writing
 

@@ -136,7 +136,7 @@ def _late(action_delay: Any, task: Task) -> Task:
     """The task with late actions, or as it is."""
     if action_delay is None:
         return task
-    from bam_envs.tasks.wrappers.late_actions import LateActions, read_delay
+    from bam_envs.tasks.task_wrappers import LateActions, read_delay
 
     late: Any = LateActions(task, read_delay(action_delay))  # most members are the task's own
     return late  # type: ignore[no-any-return]

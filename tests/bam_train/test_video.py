@@ -9,7 +9,7 @@ from PIL import Image
 from bam_envs.core.errors import MissingExtra
 from bam_train.errors import OutputError, SettingsError
 from bam_train.evaluation import record_video
-from bam_train.files.video import open_video, require_video_path
+from bam_train.files.pictures import open_video, require_video_path
 
 
 class Right:

@@ -79,6 +79,18 @@ def table_row(*cells):
     return f"| {' | '.join(cells)} |"
 
 
+def made_row(*cells):
+    """The same, with a last cell that says when and with which commit it was measured."""
+    return table_row(*cells, f"{origin()['created'][:10]}, {str(origin()['git_commit'])[:7]}")
+
+
+def rows_of_page(page, key):
+    """The rows of a page of `write_table`, by what `key` makes of their cells."""
+    lines = page.read_text().splitlines() if page.exists() else []
+    rows = [line for line in lines if line.startswith("| ") and not line.startswith("| ---")][1:]
+    return {key(*line.strip("| ").split(" | ")): line for line in rows}
+
+
 def write_table(page, head, header, rows):
     """Write a page of Markdown with a table, and the computer and versions that its newest rows are of."""
     versions = ", ".join(f"{name} {version}" for name, version in origin()["versions"].items())
@@ -140,6 +152,27 @@ def ratio(slow, fast):
 def program(name, *arguments):
     """The command of one of our programs, such as ``train``, in this Python."""
     return [sys.executable, "-m", f"bam_train.cli.{name}", *map(str, arguments)]
+
+
+class Ended(NamedTuple):
+    """How a program ended; times and memory are its own and those of its children."""
+
+    status: int
+    seconds: float
+    cpu: float
+    text: str
+    """What it printed."""
+
+
+def ended(command, folder, cwd=ROOT):
+    """Run a command to its end; what it prints is in ``output.txt`` in `folder` too."""
+    begun = time.monotonic()
+    with (folder / "output.txt").open("w+") as output:
+        process = subprocess.Popen(command, stdout=output, stderr=output, cwd=cwd)
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode, seconds = os.waitstatus_to_exitcode(status), time.monotonic() - begun
+        output.seek(0)
+        return Ended(process.returncode, seconds, used.ru_utime + used.ru_stime, output.read())
 
 
 def resident():

@@ -14,12 +14,9 @@ Examples:
 """
 
 import re
-import resource
 import shlex
-import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -31,8 +28,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.cli.flags import Count, Seed
 from bam_train.evaluation import evaluate
 from bam_train.policy import FrozenPolicy
-from bam_train.trainers.base import origin
-from tests.benchmarks.harness import CHECKPOINTS, ROOT, table_row, write_table
+from tests.benchmarks.harness import CHECKPOINTS, ROOT, ended, made_row, rows_of_page, write_table
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 LOG = CHECKPOINTS / "commands.md"
@@ -110,15 +106,12 @@ def run(words: tuple[str, ...], seed: int, folder: Path, episodes: int) -> Resul
     program = ["-m", "bam_train.cli.train", *words[1:]] if words[0] == "bam-train" else words[1:]
     given = [str(ROOT / word) if word.endswith((".zip", ".py")) else word for word in program]
     given += ["--seed", str(seed), *(["--out", "policy.zip"] if writes else [])]
-    before, cpu = time.monotonic(), children()
-    with (folder / "output.txt").open("w") as output:
-        done = subprocess.run([sys.executable, *given], cwd=folder, stdout=output, stderr=output, check=False)
-    took = time.monotonic() - before, children() - cpu
-    if done.returncode:
-        return Result(done.returncode, *took, 0, None, None, None)
+    end = ended([sys.executable, *given], folder, folder)
+    took = end.seconds, end.cpu
+    if end.status:
+        return Result(end.status, *took, 0, None, None, None)
     if not writes:
-        text = (folder / "output.txt").read_text()
-        rate, steps = re.findall(r"success ([\d.]+)% in .* after ([\d,]+) steps", text)[0]
+        rate, steps = re.findall(r"success ([\d.]+)% in .* after ([\d,]+) steps", end.text)[0]
         return Result(0, *took, int(steps.replace(",", "")), float(rate) / 100, None, None)
     manifest = Checkpoint.open(folder / "policy.zip").manifest
     policy = FrozenPolicy.load(folder / "policy.zip")
@@ -127,26 +120,17 @@ def run(words: tuple[str, ...], seed: int, folder: Path, episodes: int) -> Resul
     return Result(0, *took, manifest.steps, report.success_rate, report.return_mean, threshold)
 
 
-def children() -> float:
-    """CPU time of the processes that were started here and have ended [s]."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
-
-
 def row(words: tuple[str, ...], seed: int, result: Result) -> str:
     """A line of the table."""
     success = "-" if result.success is None else f"{result.success:.1%}"
     reward = "-" if result.reward is None else f"{result.reward:.2f}"
-    made, commit = origin()["created"][:10], str(origin()["git_commit"])[:7]
     numbers = f"{result.steps:,}", f"{result.seconds:.0f} s", f"{result.cpu:.0f} s", success, reward, result.learnt
-    return table_row(f"`{shlex.join(words)}`", str(seed), *numbers, f"{made}, {commit}")
+    return made_row(f"`{shlex.join(words)}`", str(seed), *numbers)
 
 
 def read_log(log: Path) -> dict[tuple[str, str], str]:
     """Command and seed of each row of a log, to the row."""
-    rows = re.findall(r"^\| `(.*?)` \| (\d+) \| .* \|$", log.read_text(), re.MULTILINE) if log.exists() else []
-    lines = log.read_text().splitlines() if rows else []
-    return dict(zip(rows, [line for line in lines if line.startswith("| `")], strict=True))
+    return rows_of_page(log, lambda command, seed, *_: (command.strip("`"), seed))
 
 
 def write_log(log: Path, rows: dict[tuple[str, str], str]) -> None:

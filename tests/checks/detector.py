@@ -33,7 +33,7 @@ from bam_envs.robots.live_like import LiveLike
 from bam_envs.robots.physics.mujoco_arm import SimulatedArm
 from bam_envs.safety.guard import TRIAL_SPEED
 from bam_envs.tasks.pick import PickTask
-from bam_envs.tasks.wrappers.late_actions import LateActions
+from bam_envs.tasks.task_wrappers import LateActions
 from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.detector import Detector, Rollout
 from bam_train.environments import environment_of, make_env, make_vector_env

@@ -14,12 +14,8 @@ import importlib
 import importlib.util
 import itertools
 import json
-import os
-import re
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,16 +33,14 @@ from bam_train.cli.flags import Seed
 from bam_train.environments import make_vector_env
 from bam_train.errors import SettingsError
 from bam_train.evaluation import FIRST_SEED, evaluate
-from bam_train.trainers.base import origin
 from bam_train.trainers.resolve_settings import read_preset
-from tests.benchmarks.harness import ROOT, program, table_row, write_table
+from tests.benchmarks.harness import ROOT, ended, made_row, program, rows_of_page, write_table
 from tests.checks.commands import LEARNT_NOTHING
 
 PAGE = ROOT / "docs" / "benchmarks.md"
 LEVELS = {"CartPole-v1": 475.0, "Pendulum-v1": -200.0, "bam/pick": 0.99}
 """Mean return of an evaluation, or share of its episodes that succeed."""
 HEADER = ("environment", "library", "reached", "steps", "CPU time", "wall time", "made")
-ROW = r"^(\| ([\w/-]*(?:v1|pick)) \| ([\w-]+).*)$"
 HEAD = """# Libraries compared
 
 PPO until an evaluation over 100 fresh episodes (200 of bam/pick) shows the mean return 475 (CartPole-v1), -200
@@ -291,22 +285,16 @@ class Run(NamedTuple):
 
 def run(env_id: str, library: str, seed: int) -> Run:
     """Train one seed in a process of its own; raises SettingsError if that failed."""
-    with tempfile.TemporaryDirectory() as name:
-        folder, begun = Path(name), time.monotonic()
-        with (folder / "output").open("w+") as output:
-            process = subprocess.Popen(command(env_id, library, seed, folder), stdout=output, stderr=output, cwd=ROOT)
-            _, status, usage = os.wait4(process.pid, 0)
-            process.returncode, seconds = os.waitstatus_to_exitcode(status), time.monotonic() - begun
-            output.seek(0)
-            text = output.read()
-        if process.returncode not in (0, LEARNT_NOTHING):
-            raise SettingsError(f"{library} on {env_id}, seed {seed}, ended with {process.returncode}: {text[-2000:]}")
+    with tempfile.TemporaryDirectory() as folder:
+        done = ended(command(env_id, library, seed, Path(folder)), Path(folder))
+        if done.status not in (0, LEARNT_NOTHING):
+            raise SettingsError(f"{library} on {env_id}, seed {seed}, ended with {done.status}: {done.text[-2000:]}")
         if LIBRARIES[library][1]:
-            end = json.loads([line for line in text.splitlines() if line.startswith('{"steps"')][-1])
-            return Run(end["reached"], end["steps"], usage.ru_utime + usage.ru_stime, seconds)
-        [path] = (folder / "runs").glob("*/outcome.json")
+            end = json.loads([line for line in done.text.splitlines() if line.startswith('{"steps"')][-1])
+            return Run(end["reached"], end["steps"], done.cpu, done.seconds)
+        [path] = Path(folder, "runs").glob("*/outcome.json")
         end = json.loads(path.read_text())
-        return Run(end["reason"] != "steps", end["steps"], usage.ru_utime + usage.ru_stime, seconds)
+        return Run(end["reason"] != "steps", end["steps"], done.cpu, done.seconds)
 
 
 def spread(values: Sequence[float], unit: str) -> str:
@@ -326,9 +314,8 @@ def row(env_id: str, library: str, runs: list[Run]) -> str:
         if good
         else ["-"] * 3
     )
-    made, commit = origin()["created"][:10], str(origin()["git_commit"])[:7]
     name = library if library in ("bam-train", "CleanRL-style") else f"{library} {version}"
-    return table_row(env_id, name, f"{len(good)} of {len(runs)}", *numbers, f"{made}, {commit}")
+    return made_row(env_id, name, f"{len(good)} of {len(runs)}", *numbers)
 
 
 @dataclass(frozen=True)
@@ -347,19 +334,13 @@ def main(args: Flags) -> int:
     """Measure, and write the page after each row."""
     if args.only not in (None, *LIBRARIES):
         raise InvalidValue(f"--only: there is no {args.only!r}. {did_you_mean(args.only, LIBRARIES)}")
-    text = args.page.read_text() if args.page.exists() else ""
-    rows = {(env_id, library): line for line, env_id, library in re.findall(ROW, text, re.MULTILINE)}
+    rows = rows_of_page(args.page, lambda env_id, library, *_: (env_id, library.split()[0]))
     chosen = (args.env,) if args.env else LEVELS, (args.only,) if args.only else LIBRARIES
     for env_id, library in itertools.product(*chosen):
         there = importlib.util.find_spec(LIBRARIES[library][0]) is not None
         if there and (args.only or (env_id, library) not in rows):
-            line = row(env_id, library, [run(env_id, library, seed) for seed in args.seeds])
-            print(line, flush=True)
-            rows[env_id, library] = line
-            write(args.page, rows)
+            rows[env_id, library] = row(env_id, library, [run(env_id, library, seed) for seed in args.seeds])
+            print(rows[env_id, library], flush=True)
+            keys = itertools.product(LEVELS, LIBRARIES)
+            write_table(args.page, HEAD, HEADER, [rows[key] for key in keys if key in rows])
     return 0
-
-
-def write(page: Path, rows: dict[tuple[str, str], str]) -> None:
-    """Write the page."""
-    write_table(page, HEAD, HEADER, [rows[key] for key in itertools.product(LEVELS, LIBRARIES) if key in rows])

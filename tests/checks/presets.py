@@ -23,9 +23,8 @@ from bam_envs.core.wording import did_you_mean
 from bam_train.cli.console import number, percent
 from bam_train.cli.flags import Count, Seed
 from bam_train.experiments.seed_statistics import estimate
-from bam_train.trainers.base import origin
 from bam_train.trainers.resolve_settings import PRESETS
-from tests.benchmarks.harness import ROOT, table_row, write_table
+from tests.benchmarks.harness import ROOT, made_row, rows_of_page, write_table
 from tests.checks.commands import Result, run
 from tests.checks.libraries import spread
 
@@ -76,7 +75,7 @@ def row(name: str, results: list[Result]) -> str:
         score = form(found.value) + ends
     cells = [f"{learnt} of {len(results)}", score, form(min(values)) if values else "-", str(ZOO.get(name, "-"))]
     cells += [spread([one.steps for one in good], ""), spread([one.cpu for one in results], " s")]
-    return table_row(name, *cells, f"{origin()['created'][:10]}, {str(origin()['git_commit'])[:7]}")
+    return made_row(name, *cells)
 
 
 @dataclass(frozen=True)
@@ -101,8 +100,7 @@ def main(args: Flags) -> int:
     for name in args.only:
         if name not in known:
             raise InvalidValue(f"--only: there is no preset {name!r} to train with. {did_you_mean(name, known)}")
-    text = args.page.read_text() if args.page.exists() else ""
-    rows = {name: line for line, name in re.findall(r"^(\| ([\w.-]+) \| \d+ of .*)$", text, re.MULTILINE)}
+    rows = rows_of_page(args.page, lambda name, *_: name)
     if args.list:
         print(*(rows.get(name, name) for name in known), sep="\n")
         return 0

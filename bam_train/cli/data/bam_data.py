@@ -262,7 +262,7 @@ def plot_data(config: flags.PlotConfig) -> None:
 def show_episode(config: flags.ShowConfig) -> None:
     """Make a film of an episode."""
     from bam_train.cli.data.views import frames
-    from bam_train.files.video import open_video, require_video_path
+    from bam_train.files.pictures import open_video, require_video_path
 
     path = require_video_path(config.out)
     data = _open(config.place)

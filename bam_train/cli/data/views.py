@@ -18,8 +18,7 @@ from bam_train.data.recorded_episode import Array, Episode, Leaf
 from bam_train.environments import make_env, must_be_named
 from bam_train.errors import SettingsError
 from bam_train.evaluation import wilson_interval
-from bam_train.files.pictures import new_figure, require_picture_path, save_figure
-from bam_train.files.video import Frame, picture
+from bam_train.files.pictures import Frame, new_figure, picture, require_picture_path, save_figure
 from bam_train.recording.recorder import number_names
 
 if TYPE_CHECKING:

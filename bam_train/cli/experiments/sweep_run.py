@@ -26,8 +26,7 @@ from bam_train.experiments.seed_runs import SeedRun, run_seeds
 from bam_train.experiments.seed_statistics import FEWEST
 from bam_train.experiments.sweep_folder import STATES, SweepFolder
 from bam_train.experiments.trial_search import Sweep, chosen, shown
-from bam_train.files.atomic_file import replacing, require_writable
-from bam_train.files.locks import locked
+from bam_train.files.atomic_file import locked, replacing, require_writable
 from bam_train.files.log_lines import aligned
 from bam_train.settings import (
     NAMES,

@@ -25,8 +25,7 @@ MOST_EVENTS = 20
 
 def replay(config: ReplayConfig) -> None:
     """Run the program with its parsed flags."""
-    from bam_train.files.pictures import require_picture_path
-    from bam_train.files.video import require_video_path
+    from bam_train.files.pictures import require_picture_path, require_video_path
     from bam_train.recording.recording import Recording
 
     picture = None if config.plot is None else require_picture_path(config.plot)
@@ -182,7 +181,7 @@ def _event_lines(recording: Recording) -> list[str]:
 def _write_video(recording: Recording, checkpoint: Checkpoint | str, named: str | None, path: Path) -> None:
     """Write a video of the recorded pictures, else of the simulated robot in the recorded states."""
     from bam_train.errors import SettingsError
-    from bam_train.files.video import open_video, picture
+    from bam_train.files.pictures import open_video, picture
     from bam_train.recording.drawing import frames
 
     period = float(recording.metadata.get("period_s", "0.05"))

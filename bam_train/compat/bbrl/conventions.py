@@ -11,8 +11,8 @@ from typing import Any
 
 from bam_envs.core.wording import brief, did_you_mean
 from bam_train.errors import LoopError, OutputError, SettingsError
-from bam_train.loop.agents.agent import Agent
-from bam_train.loop.agents.agents import SeedableAgent
+from bam_train.loop.agent import Agent
+from bam_train.loop.agents import SeedableAgent
 
 
 class TimeAgent(Agent):

@@ -14,7 +14,7 @@ import torch
 
 from bam_envs.core.validation import NonNegativeInt, check
 from bam_train.errors import LoopError
-from bam_train.loop.agents.agent import Agent
+from bam_train.loop.agent import Agent
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -12,8 +12,8 @@ import numpy as np
 from gymnasium.wrappers import Autoreset
 
 from bam_train.errors import SettingsError
-from bam_train.loop.gym.gym_spaces import Arrays
-from bam_train.loop.gym.parallel_gym_agent import Env, ParallelGymAgent, has_autoreset
+from bam_train.loop.gym_spaces import Arrays
+from bam_train.loop.parallel_gym_agent import Env, ParallelGymAgent, has_autoreset
 
 
 class _OldGymAgent(ParallelGymAgent):

@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING, Any
 from bam_train.compat.bbrl.shared_workspace import SharedWorkspace, shared_workspace
 from bam_train.compat.bbrl.worker import Worker, close_all, wait_for
 from bam_train.errors import LoopError
-from bam_train.loop.agents.agent import Agent, agent_name
-from bam_train.loop.agents.agents import Agents
+from bam_train.loop.agent import Agent, agent_name
+from bam_train.loop.agents import Agents
 from bam_train.loop.workspace.workspace import Workspace
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ import torch
 import torch.multiprocessing  # teaches pickle to share tensors
 
 from bam_train.errors import LoopError
-from bam_train.loop.agents.agent import Agent, agent_name
+from bam_train.loop.agent import Agent, agent_name
 from bam_train.signals import drop_handlers
 
 PATIENCE = 5.0

@@ -15,9 +15,9 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from bam_train.env_faults import FiniteVectorEnv
 from bam_train.environments import make_vector_env
 from bam_train.errors import SettingsError
-from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.settings import ImitationSettings
 from bam_train.trainers.learning.networks import Descent, Encoders, LearntPolicy, Numbers, two_layers
 from bam_train.trainers.learning.replay_memory import ActionCode, ReplayMemory

@@ -21,9 +21,8 @@ import gymnasium as gym
 
 import bam_envs  # noqa: F401 - registers our environments with Gymnasium
 from bam_envs.core.registry import ENVIRONMENTS
+from bam_train.env_faults import FiniteEnv, ForeignEnv
 from bam_train.environments import is_batched
-from bam_train.finite_envs import FiniteEnv
-from bam_train.foreign_env import ForeignEnv
 from bam_train.trainers.zero_based_spaces import from_zero
 
 if TYPE_CHECKING:

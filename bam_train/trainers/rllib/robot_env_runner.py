@@ -31,9 +31,9 @@ from ray.rllib.utils.metrics import RLMODULE_INFERENCE_TIMER, WEIGHTS_SEQ_NO
 from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 
 from bam_envs.core.registry import resolve_id
+from bam_train.env_faults import FiniteVectorEnv
 from bam_train.environments import is_batched, make_vector_env
 from bam_train.errors import SettingsError
-from bam_train.finite_envs import FiniteVectorEnv
 from bam_train.rollout import success_of
 from bam_train.trainers.rllib.mean_std_filter import MeanStdFilter
 from bam_train.trainers.rllib.rllib_freezing import LAYOUT_CONNECTORS

@@ -12,9 +12,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from bam_envs.core.location import HERE, Location, Remote
+from bam_train.env_faults import FiniteEnv, FiniteVectorEnv
 from bam_train.environments import is_batched, make_env, make_vector_env
 from bam_train.errors import SettingsError
-from bam_train.finite_envs import FiniteEnv, FiniteVectorEnv
 from bam_train.rollout import success_of
 from bam_train.trainers.zero_based_spaces import from_zero
 

@@ -94,7 +94,7 @@ class EnvEntry:
         task: Task = kind(num_envs, **own)
         cameras = self.read_cameras(given)
         if cameras:
-            task = resolve("bam_envs.tasks.wrappers.camera_task:CameraTask")(task, cameras)
+            task = resolve("bam_envs.tasks.task_wrappers:CameraTask")(task, cameras)
         return task
 
     def make_robot(self, num_robots: int, randomize: bool, task_options: Mapping[str, Any]) -> Robot:
@@ -180,103 +180,53 @@ _ENTRIES = (
         period=0.1,
         robot_options=("robot_model",),
     ),
-    EnvEntry(
-        "bam/ur-reach-v0",
-        "bring the flange of a UR arm of any size within 10 cm of a point",
-        "bam_envs.tasks.ur_reach:UrReachTask",
-        "bam_envs.robots.physics.kinematic_arm:reach_arm",
-        max_episode_steps=300,
-        period=0.1,
-        robot_options=("ur_model",),
+    *(
+        EnvEntry(
+            f"bam/{name}-v0",
+            summary,
+            f"bam_envs.tasks.{task}",
+            f"bam_envs.robots.physics.kinematic_arm:{scene}",
+            max_episode_steps=steps,
+            period=period,
+            robot_options=("ur_model",),
+        )
+        for name, task, scene, steps, period, summary in (
+            (
+                *("ur-reach", "ur_reach:UrReachTask", "reach_arm", 300, 0.1),
+                "bring the flange of a UR arm of any size within 10 cm of a point",
+            ),
+            (
+                *("ur-empty", "ur_arm:UrEmptyTask", "empty_arm", 300, 0.05),
+                "a UR arm and nothing to do: for trying out actions",
+            ),
+            (
+                *("ur-avoidance", "ur_avoidance:UrAvoidanceTask", "obstacle_arm", 1000, 0.05),
+                "stay at a pose and out of the way of an obstacle that moves up and down",
+            ),
+            (
+                *("ur-track", "ur_track:UrTrackTask", "obstacle_arm", 1000, 0.05),
+                "follow a recorded joint trajectory and make way for an obstacle that flies about",
+            ),
+            (
+                *("isaac-reach", "isaac_reach:IsaacReachTask", "isaac_arm", 600, 1 / 30),
+                "bring the flange of a UR10 to a pose, position and orientation, as in Isaac Lab's reach task",
+            ),
+        )
     ),
-    EnvEntry(
-        "bam/ur-empty-v0",
-        "a UR arm and nothing to do: for trying out actions",
-        "bam_envs.tasks.ur_empty:UrEmptyTask",
-        "bam_envs.robots.physics.kinematic_arm:empty_arm",
-        max_episode_steps=300,
-        robot_options=("ur_model",),
-    ),
-    EnvEntry(
-        "bam/ur-avoidance-v0",
-        "stay at a pose and out of the way of an obstacle that moves up and down",
-        "bam_envs.tasks.ur_avoidance:UrAvoidanceTask",
-        "bam_envs.robots.physics.kinematic_arm:obstacle_arm",
-        max_episode_steps=1000,
-        robot_options=("ur_model",),
-    ),
-    EnvEntry(
-        "bam/ur-track-v0",
-        "follow a recorded joint trajectory and make way for an obstacle that flies about",
-        "bam_envs.tasks.ur_track:UrTrackTask",
-        "bam_envs.robots.physics.kinematic_arm:obstacle_arm",
-        max_episode_steps=1000,
-        robot_options=("ur_model",),
-    ),
-    EnvEntry(
-        "bam/isaac-reach-v0",
-        "bring the flange of a UR10 to a pose, position and orientation, as in Isaac Lab's reach task",
-        "bam_envs.tasks.isaac_reach:IsaacReachTask",
-        "bam_envs.robots.physics.kinematic_arm:isaac_arm",
-        max_episode_steps=600,
-        period=1 / 30,
-        robot_options=("ur_model",),
-    ),
-    EnvEntry(
-        "bam/grid-world-v0",
-        "walk to a target on a square board",
-        "bam_envs.local.grid_world:GridWorld",
-        NO_ROBOT,
-        max_episode_steps=100,
-        period=0.1,
-    ),
-    EnvEntry(
-        "bam/classic-bandit-v0",
-        "pull the arm that wins most often",
-        "bam_envs.local.bandits:ClassicBandit",
-        NO_ROBOT,
-        max_episode_steps=1,
-        period=0.1,
-    ),
-    EnvEntry(
-        "bam/context-bandit-v0",
-        "pull the arm that wins most often in the context that is shown",
-        "bam_envs.local.bandits:ContextBandit",
-        NO_ROBOT,
-        max_episode_steps=1,
-        period=0.1,
-    ),
-    EnvEntry(
-        "bam/image-bandit-v0",
-        "pull the arm that gives most for the picture that is shown",
-        "bam_envs.local.bandits:ImageBandit",
-        NO_ROBOT,
-        max_episode_steps=1,
-        period=0.1,
-    ),
-    EnvEntry(
-        "bam/digits-v0",
-        "tell which digit a picture of 8 x 8 pixels shows",
-        "bam_envs.local.digits:Digits",
-        NO_ROBOT,
-        max_episode_steps=1,
-        period=0.1,
-    ),
-    EnvEntry(
-        "bam/mnist-v0",
-        "tell which digit a picture of MNIST shows",
-        "bam_envs.local.digits:Mnist",
-        NO_ROBOT,
-        max_episode_steps=1,
-        period=0.1,
-    ),
-    EnvEntry(
-        "bam/grasp-xy-v0",
-        "touch one of five circles in a picture",
-        "bam_envs.local.grasp_xy:GraspXY",
-        NO_ROBOT,
-        max_episode_steps=1,
-        period=0.1,
+    *(
+        EnvEntry(f"bam/{name}-v0", summary, f"bam_envs.local.{task}", NO_ROBOT, steps, period=0.1)
+        for name, task, steps, summary in (
+            ("grid-world", "grid_world:GridWorld", 100, "walk to a target on a square board"),
+            ("classic-bandit", "bandits:ClassicBandit", 1, "pull the arm that wins most often"),
+            (
+                *("context-bandit", "bandits:ContextBandit", 1),
+                "pull the arm that wins most often in the context that is shown",
+            ),
+            ("image-bandit", "bandits:ImageBandit", 1, "pull the arm that gives most for the picture that is shown"),
+            ("digits", "picture_tasks:Digits", 1, "tell which digit a picture of 8 x 8 pixels shows"),
+            ("mnist", "picture_tasks:Mnist", 1, "tell which digit a picture of MNIST shows"),
+            ("grasp-xy", "picture_tasks:GraspXY", 1, "touch one of five circles in a picture"),
+        )
     ),
     EnvEntry(
         "bam/obs-v0",

@@ -14,9 +14,8 @@ from bam_envs.robots.ur import JOINTS, START
 from bam_envs.tasks.avoidance import AvoidanceTask
 from bam_envs.tasks.isaac_reach import TOOL1, IsaacReachTask
 from bam_envs.tasks.navigation import ARRIVED, BOUNDARY, MAX_STEPS, DriveTask, NavigationTask
-from bam_envs.tasks.ur_arm import UrTask, in_frame, joint_labels, normalised, spherical
+from bam_envs.tasks.ur_arm import UrEmptyTask, UrTask, in_frame, joint_labels, normalised, spherical
 from bam_envs.tasks.ur_avoidance import COLLISION, UrAvoidanceTask, UrObstacleTask, obstacle_labels
-from bam_envs.tasks.ur_empty import UrEmptyTask
 from bam_envs.tasks.ur_reach import UrReachTask
 from bam_envs.tasks.ur_track import FIXED_PATHS, UrTrackTask
 

@@ -5,7 +5,7 @@ import pytest
 from bam_envs.core.location import HERE, Credentials, LiveRobot, Remote, addresses, location_of
 from bam_envs.core.wording import as_flag
 from bam_train.deploy.guard_table import read_guards
-from bam_train.environments.made_env import with_live_robot
+from bam_train.environments import with_live_robot
 from bam_train.errors import SettingsError
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.local.digits import Digits, Mnist
+from bam_envs.local.picture_tasks import Digits, Mnist
 from tests.object_store import bucket_fixture  # noqa: F401
 
 

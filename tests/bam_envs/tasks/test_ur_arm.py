@@ -6,8 +6,7 @@ import pytest
 from bam_envs.core.errors import InvalidValue
 from bam_envs.core.robot import RobotState
 from bam_envs.robots.ur import UR_MODELS
-from bam_envs.tasks.ur_arm import in_frame, joint_option, normalised, spherical, wire_states
-from bam_envs.tasks.ur_empty import UrEmptyTask
+from bam_envs.tasks.ur_arm import UrEmptyTask, in_frame, joint_option, normalised, spherical, wire_states
 from bam_envs.tasks.ur_reach import UrReachTask
 
 JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")

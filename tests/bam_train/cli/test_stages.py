@@ -22,7 +22,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
 from bam_train.deploy.checkpoint_admission import Admission
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
-from bam_train.environments.made_env import with_live_robot
+from bam_train.environments import with_live_robot
 from bam_train.errors import FormatError, SettingsError
 from bam_train.recording.recording import Recording
 from tests.bam_train.deploy.test_deployment import Driven, raises

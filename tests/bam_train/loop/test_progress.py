@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from bam_train.loop import Agent, TemporalAgent, Workspace
-from bam_train.loop.agents.progress import StepsPerSecond, progress_display
+from bam_train.loop.progress import StepsPerSecond, progress_display
 
 
 @pytest.fixture
@@ -173,7 +173,7 @@ def test_a_copy_of_a_temporal_agent_can_be_made():
 
 
 def test_without_a_display_rich_is_not_needed(monkeypatch):
-    monkeypatch.delitem(sys.modules, "bam_train.loop.agents.progress")
+    monkeypatch.delitem(sys.modules, "bam_train.loop.progress")
     monkeypatch.setitem(sys.modules, "rich.progress", None)
     ws = Workspace()
     TemporalAgent(Nothing())(ws, n_steps=2)

@@ -28,12 +28,12 @@ from gymnasium.wrappers import Autoreset
 
 from bam_envs.safety.gate import SafeRobot
 from bam_train.errors import SettingsError
-from bam_train.files.video import Frame, open_video, picture, require_video_path
-from bam_train.loop.agents.agent import Agent, import_torch
-from bam_train.loop.agents.agents import Agents, KWAgentWrapper
-from bam_train.loop.agents.temporal_agent import TemporalAgent
-from bam_train.loop.gym.gym_agent import GymAgent
-from bam_train.loop.gym.gym_spaces import Arrays, each_action, flat, kinds, pack
+from bam_train.files.pictures import Frame, open_video, picture, require_video_path
+from bam_train.loop.agent import Agent, import_torch
+from bam_train.loop.agents import Agents, KWAgentWrapper
+from bam_train.loop.gym_agent import GymAgent
+from bam_train.loop.gym_spaces import Arrays, each_action, flat, kinds, pack
+from bam_train.loop.temporal_agent import TemporalAgent
 from bam_train.loop.workspace.workspace import Workspace
 
 Env = gym.Env[Any, Any]

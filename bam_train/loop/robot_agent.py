@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bam_envs.core.robot_env import halt_and_close, robot_of
+from bam_train.env_faults import require_finite_action
 from bam_train.errors import LoopError
-from bam_train.finite_envs import require_finite_action
-from bam_train.loop.agents.agent import Agent
-from bam_train.loop.agents.agents import Agents
-from bam_train.loop.agents.temporal_agent import TemporalAgent
-from bam_train.loop.gym.gym_agent import NUMBERS
-from bam_train.loop.gym.gym_spaces import Kind, flat, kinds, names, pack
+from bam_train.loop.agent import Agent
+from bam_train.loop.agents import Agents
+from bam_train.loop.gym_agent import NUMBERS
+from bam_train.loop.gym_spaces import Kind, flat, kinds, names, pack
+from bam_train.loop.temporal_agent import TemporalAgent
 from bam_train.loop.workspace.workspace import Sink, Workspace
 
 SUCCESS = "info/is_success"

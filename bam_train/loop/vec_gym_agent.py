@@ -26,8 +26,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from bam_train.errors import LoopError, SettingsError
-from bam_train.loop.gym.gym_agent import GymAgent
-from bam_train.loop.gym.gym_spaces import Array, Arrays, batch_action, flat, kinds, pick
+from bam_train.loop.gym_agent import GymAgent
+from bam_train.loop.gym_spaces import Array, Arrays, batch_action, flat, kinds, pick
 
 
 class VecGymAgent(GymAgent):

@@ -5,7 +5,7 @@ import pytest
 
 from bam_envs.core.errors import InvalidValue
 from bam_envs.tasks.reach import ReachTask
-from bam_envs.tasks.wrappers.late_actions import LateActions, read_delay
+from bam_envs.tasks.task_wrappers import LateActions, read_delay
 from bam_envs.testing import TaskContract
 from tests.bam_envs.making import ROBOTS, make_task
 

@@ -11,8 +11,8 @@ from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 from bam_train.errors import LoopError
-from bam_train.loop.agents.agent import Agent, agent_name, is_live
-from bam_train.loop.agents.agents import Agents, KWAgentWrapper
+from bam_train.loop.agent import Agent, agent_name, is_live
+from bam_train.loop.agents import Agents, KWAgentWrapper
 from bam_train.loop.workspace.variables import unknown_variable
 from bam_train.loop.workspace.workspace import Workspace
 
@@ -77,7 +77,7 @@ class TemporalAgent(Agent):
             _check(self.agent, workspace, stop_variable)
             display: Any = nullcontext(None)
             if self.progress is not False:
-                from bam_train.loop.agents.progress import progress_display
+                from bam_train.loop.progress import progress_display
 
                 display = progress_display(self.progress, n_steps, t, self.name or "steps")
             with display as advance:

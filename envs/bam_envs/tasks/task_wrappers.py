@@ -1,19 +1,75 @@
-"""Tasks with delayed actions, like those of a slow policy, or of a policy on another computer than the task."""
+"""Tasks around tasks: seen through cameras, and with actions that come late.
+
+A task with delayed actions is like that of a slow policy, or of a policy on another computer than the task.
+"""
 
 from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
+from gymnasium import spaces
 from msgspec import Meta
 from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.robot import EnvIds, Initial, RobotState
-from bam_envs.core.task import Array, Floats, Score, Task
+from bam_envs.core.robot import CameraSpec, EnvIds, Initial, RobotState
+from bam_envs.core.task import Array, Floats, Label, Score, Task, labelled_box, limited
 from bam_envs.core.validation import check
 from bam_envs.robots.room import mixed
 
+VECTOR = "robot"
+"""Key of the vector in an observation; images have the names of their signals."""
 _Steps = Annotated[int, Meta(ge=0, le=32, description="a whole number from 0 to 32, or two of them")]
+
+
+class _Wrapper:
+    """A task around `task`, which has all its other attributes."""
+
+    task: Any
+
+    def __getattr__(self, name: str) -> Any:
+        """Any other attribute is that of the task."""
+        if name == "task" or name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self.task, name)
+
+
+class CameraTask(_Wrapper):
+    """A `Task` around a `Task`, whose observations are images and a vector without anything that a tracker measures.
+
+    The wrapped task has `robot_labels`, and `robot_columns(state)`, the numbers of the vector, not clipped. Reward and
+    success are still those of the tracked object.
+
+    Args:
+        task: The task.
+        cameras: The cameras of its robot, in the order of the observation.
+    """
+
+    def __init__(self, task: Any, cameras: Sequence[CameraSpec]) -> None:
+        self.task = task
+        self.state_space: spaces.Box = self.task.observation_space
+        """Space of `state_observation`."""
+        self._vector = labelled_box(self.task.robot_labels)
+        self._images = {name: box for camera in cameras for name, box in camera.spaces().items()}
+        self.observation_space = spaces.Dict({**self._images, VECTOR: self._vector})
+        pictures = [_label(name, box) for name, box in sorted(self._images.items())]
+        self.observation_labels = (*self.task.robot_labels, *pictures)
+
+    def observe(self, state: RobotState) -> dict[str, Any]:
+        """Images, uint8 (n, height, width, channels), depth float32, and the vector (n, k) float32."""
+        vector = np.concatenate(self.task.robot_columns(state), axis=1).astype(np.float32)
+        seen = {name: state.signals[name] for name in self._images}
+        return {**seen, VECTOR: limited(vector, self._vector.low, self._vector.high)}
+
+    def state_observation(self, state: RobotState) -> Floats:
+        """The observation of the wrapped task, for a teacher that knows what cameras only see. Shape: (n, k)."""
+        observation: Floats = self.task.observe(state)
+        return observation
+
+
+def _label(name: str, box: spaces.Box) -> Label:
+    unit = "m" if box.dtype == np.float32 else "1"
+    return Label(name, "image of a camera", unit, low=float(box.low.flat[0]), high=float(box.high.flat[0]))
 
 
 def read_delay(value: object) -> tuple[int, int]:
@@ -31,7 +87,7 @@ def read_delay(value: object) -> tuple[int, int]:
     return least, most
 
 
-class LateActions:
+class LateActions(_Wrapper):
     """A `Task` around a `Task`: an action takes effect some steps later; until then, the action is zero.
 
     The delay is drawn for each episode from its seed.
@@ -48,12 +104,6 @@ class LateActions:
         self._actions = np.zeros(
             (task.num_envs, self._most + 1, *(task.action_space.shape or ())), np.float32
         )  # newest first
-
-    def __getattr__(self, name: str) -> Any:
-        """Any other attribute is that of the task: spaces, labels, observations, options of `reset`."""
-        if name == "task" or name.startswith("__"):
-            raise AttributeError(name)
-        return getattr(self.task, name)
 
     def sample_initial(self, env_ids: EnvIds, rngs: Sequence[np.random.Generator], *options: Any) -> Initial:
         """The start of the task, and the delays of these episodes."""

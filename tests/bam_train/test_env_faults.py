@@ -9,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from bam_train.env_faults import FiniteEnv, FiniteVectorEnv
 from bam_train.environments import make_vector_env
 from bam_train.errors import EnvironmentFailed
 from bam_train.evaluation import evaluate
-from bam_train.finite_envs import FiniteEnv, FiniteVectorEnv
 from bam_train.trainers.sb3.sb3_vec_env import make_training_env
 
 CASES = [

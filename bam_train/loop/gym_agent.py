@@ -13,9 +13,9 @@ import numpy as np
 from gymnasium import Space, spaces
 
 from bam_train.errors import LoopError, SettingsError
-from bam_train.loop.agents.agent import agent_name, import_torch
-from bam_train.loop.agents.agents import SeedableAgent
-from bam_train.loop.gym.gym_spaces import Array, Arrays, InfoRecorder, Kind, names
+from bam_train.loop.agent import agent_name, import_torch
+from bam_train.loop.agents import SeedableAgent
+from bam_train.loop.gym_spaces import Array, Arrays, InfoRecorder, Kind, names
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bam_train.errors import LoopError
-from bam_train.loop.agents.agent import Agent, agent_name, is_module
+from bam_train.loop.agent import Agent, agent_name, is_module
 
 
 class Agents(Agent):

@@ -1,1 +1,0 @@
-"""Gymnasium environments as agents of the loop."""
