@@ -34,6 +34,8 @@ from bam_train.errors import BamTrainError, FormatError, RequestRefused, Setting
 _log = logging.getLogger(__name__)
 _EPISODE_TIMEOUT = 3600.0  # longest wait for the end of an episode [s]
 _TRIAL_TIMEOUT = 24 * 3600.0  # longest wait for the end of a trial [s]
+ROBOT_TIMEOUT = 20.0
+"""Longest wait for the robot to come back, before a candidate is refused [s]."""
 _STATE_POLL_PERIOD = 0.2  # [s]
 _ONCE = {
     State.WAITING: "the robot is there again",
@@ -174,26 +176,40 @@ class Succession:
     def _push(self, ask: Ask) -> dict[str, Any]:
         path = Path(ask.arguments["path"])
         try:
-            verdict = self._checked(path, str(ask.arguments.get("file") or "the candidate"), ask)
+            session = self._robot(ask)
+            verdict = self._checked(path, str(ask.arguments.get("file") or "the candidate"), ask, session)
         finally:
             path.unlink(missing_ok=True)
-        return {**self._choose(self.versions.find(verdict.digest), ask), "lines": list(verdict.lines)}
+        return {**self._choose(self.versions.find(verdict.digest), ask, session), "lines": list(verdict.lines)}
 
     def _use(self, ask: Ask) -> dict[str, Any]:
-        version = self.versions.find(str(ask.arguments.get("version", "")))
-        self._checked(version.path, version.digest[:12], ask)  # it may be of a time when the agent ran something else
-        return self._choose(version, ask)
+        version, session = self.versions.find(str(ask.arguments.get("version", ""))), self._robot(ask)
+        # It may be of a time when the agent ran something else.
+        self._checked(version.path, version.digest[:12], ask, session)
+        return self._choose(version, ask, session)
 
-    def _checked(self, path: Path, name: str, ask: Ask) -> Verdict:
-        """Check a file in another process, which puts it into the folder.
+    def _robot(self, ask: Ask) -> RobotSession:
+        """The robot that a candidate is for, which may be lost later; one that is away is waited for.
 
         Raises:
-            RequestRefused: It is refused.
-            RequestRefused: There is no robot to check it for.
+            RequestRefused: It did not come back in `ROBOT_TIMEOUT`.
         """
-        resident, session = self._resident, self._resident.session
-        if session is None:
-            raise RequestRefused("the agent waits for the robot, and checks no candidate without it; push it later")
+        resident, end = self._resident, time.monotonic() + ROBOT_TIMEOUT
+        if resident.session is None:
+            why = resident.why.rstrip(".")
+            resident.send(RequestProgress(ask.number, f"waits at most {ROBOT_TIMEOUT:g} s for the robot: {why}"))
+        while (session := resident.session) is None:
+            if time.monotonic() > end:
+                raise RequestRefused(
+                    f"the agent has waited {ROBOT_TIMEOUT:g} s for the robot, and checks no candidate without it; push "
+                    f"it later: {resident.why.rstrip('.')}"
+                )
+            time.sleep(_STATE_POLL_PERIOD)
+        return session
+
+    def _checked(self, path: Path, name: str, ask: Ask, session: RobotSession) -> Verdict:
+        """Check a file in another process, which puts it into the folder; `RequestRefused` if it is refused."""
+        resident = self._resident
         resident.send(RequestProgress(ask.number, "checking"))
         verdict = check_candidate(
             CandidateRequest(
@@ -212,10 +228,10 @@ class Succession:
             raise RequestRefused(verdict.reason, "CandidateRefused")
         return verdict
 
-    def _choose(self, version: Version, ask: Ask) -> dict[str, Any]:
+    def _choose(self, version: Version, ask: Ask, session: RobotSession) -> dict[str, Any]:
         """Let `version` act as the request says, and wait until it does."""
         resident, arguments = self._resident, ask.arguments
-        choice = self._made(version, ask)
+        choice = self._made(version, ask, session)
         when = "tick" if choice.at_once else "episode"
         resident.send(RequestProgress(ask.number, f"accepted; it acts from the next {when} on"))
         resident.choose(choice)
@@ -253,12 +269,11 @@ class Succession:
             if time.monotonic() > end:
                 raise RequestRefused("the trial did not end in a day")
 
-    def _made(self, version: Version, ask: Ask) -> Choice:
+    def _made(self, version: Version, ask: Ask, session: RobotSession) -> Choice:
         resident, digest = self._resident, version.digest
-        session, policy = resident.session, self._policies.get(digest) or load_policy(version)
+        policy = self._policies.get(digest) or load_policy(version)
         stage, address = ask.arguments.get("stage", "auto"), resident.options.robot.text
-        identity = "" if session is None else session.identity
-        is_real = session is not None and session.is_real
+        identity, is_real = session.identity, session.is_real
         checkpoint = Checkpoint.open(version.path, members=False)
         record = resident.options.folder / "trials.jsonl"
         trials = trials_of(checkpoint, record, identity, address, simulated=not is_real)

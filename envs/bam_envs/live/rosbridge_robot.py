@@ -11,6 +11,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -565,22 +566,33 @@ class RosbridgeRobot:
             return  # whoever has not taken over from a live agent must not stop it by looking
         first = self._sending.acquire(timeout=_HALT_WAITS)
         try:
+            halting.do_surely(partial(self._publish_halt, halting))
+        except LinkLost as error:
+            self._note_halt(error)
+        finally:
+            if self._goals is not None:
+                self._goals.cancel()
+            if first:
+                self._sending.release()
+
+    def _publish_halt(self, halting: RosbridgeLink) -> None:
+        """Send the halt, on the network thread, which a busy computer may hold up: a hold begins where the robot is."""
+        try:
             halting.publish(self.namespace + HALT_TOPIC, {})
             # Whoever only looks must not hold a robot that somebody else moves.
             others = not self._commanded and self._readiness is not None and self._readiness.has_rival
             if not self._describes_itself and not others:
                 self._publish_hold(halting)
             self._halt_failed = False
-        except BamEnvsError as error:  # reported once: several threads and `close` try it too
-            if not self._halt_failed:
-                why = bare_reason(halting.url, error).removesuffix(_NOTHING_SENT)
-                _LOG.warning("%s: the halt could not be sent, %s: %s.", self.url, why, _BY_HAND)
-            self._halt_failed = True
-        finally:
-            if self._goals is not None:
-                self._goals.cancel()
-            if first:
-                self._sending.release()
+        except BamEnvsError as error:
+            self._note_halt(error)
+
+    def _note_halt(self, error: BamEnvsError) -> None:
+        """Report a halt that was not sent, once: several threads and `close` try it too."""
+        if not self._halt_failed:
+            why = bare_reason(self.url, error).removesuffix(_NOTHING_SENT)
+            _LOG.warning("%s: the halt could not be sent, %s: %s.", self.url, why, _BY_HAND)
+        self._halt_failed = True
 
     def _publish_hold(self, halting: RosbridgeLink) -> None:
         """Send a robot without a halt topic a command to hold; unknown numbers are not commanded.

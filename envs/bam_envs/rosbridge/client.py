@@ -154,6 +154,14 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
 
     # ---- used by any thread
 
+    def do_surely(self, work: Callable[[], object]) -> None:
+        """Call `work` on the network thread, where it sends what may not be given up: a halt.
+
+        `LinkLost` if the link is down, or if the thread is held up, as on a busy computer: then it is called later.
+        """
+        self._require_up()
+        self._thread.do(work, SEND_WITHIN, surely=True)
+
     def _use(self, callback: Callable[[Connection], object]) -> None:
         """Call `callback` with the connection on the network thread, now or not at all."""
         self._thread.do(partial(callback, self._require_up()), SEND_WITHIN)

@@ -59,10 +59,10 @@ class LoopThread:
             return False
         return True
 
-    def do(self, work: Callable[[], T], within: float = _PATIENCE) -> T:
+    def do(self, work: Callable[[], T], within: float = _PATIENCE, *, surely: bool = False) -> T:
         """Run `work` in the thread, or in the caller's if the loop does not run, and return its result.
 
-        `LinkLost` if it had not begun after `within` [s]; it is not run later.
+        `LinkLost` if it had not begun after `within` [s]; then it is not run later, or, if `surely`, it still is.
         """
         done: Future[T] = Future()
 
@@ -78,6 +78,10 @@ class LoopThread:
         try:
             return done.result(within)
         except NoResultYet:
+            if surely:
+                raise LinkLost(
+                    f"{self._owner}: the network thread took nothing for {within:g} s, and does this once it can."
+                ) from None
             if done.cancel():
                 raise LinkLost(
                     f"{self._owner}: the network thread took nothing for {within:g} s; nothing was sent. "
@@ -85,7 +89,8 @@ class LoopThread:
                 ) from None
             return done.result()  # it is running
         finally:
-            done.cancel()  # also after Ctrl-C: work that has not begun is not wanted any more
+            if not surely:
+                done.cancel()  # also after Ctrl-C: work that has not begun is not wanted any more
 
     async def _run(self, main: Callable[[Future[None]], Coroutine[Any, Any, None]], ready: Future[None]) -> None:
         self.loop = asyncio.get_running_loop()

@@ -382,6 +382,29 @@ def test_a_halt_that_cannot_be_sent_is_told_once(server, robot_on, connect, capl
         assert line.count(server.url) == 1
 
 
+def test_a_halt_that_a_busy_computer_holds_up_comes_late_and_holds_the_arm_where_it_is_then(
+    server, robot_on, connect, caplog, until
+):
+    scripted, entered, leave = robot_on(server), threading.Event(), threading.Event()
+    robot, gate = connect(server.url)
+    gate.step(gate.state.command)
+    server.advertise("/busy", "std_msgs/Empty")
+    robot._halting.subscribe("/busy", "std_msgs/Empty", lambda *_: (entered.set(), leave.wait(10.0)))
+    until(lambda: server.publish("/busy", {}) or entered.wait(0.05))
+    robot.halt()
+    assert scripted.halts == 0
+    there = (scripted.signals["joint_position"] + 0.01).tolist()
+    scripted.signals["joint_position"][:] = there
+    until(lambda: robot.measure().signals["joint_position"][0].tolist() == there)
+    leave.set()
+    scripted.wait_for(lambda: scripted.halts == 1 and len(scripted.on(JOINT_COMMANDS)) == 2)
+    assert scripted.on(JOINT_COMMANDS)[1]["data"] == there
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{server.url}: the halt could not be sent, the network thread took nothing for 0.5 s, and does this once it "
+        "can: stop it by hand if it moves; a robot with a command timeout stops by itself."
+    ]
+
+
 def test_a_command_that_a_halt_overtook_is_not_sent(server, robot_on, connect):
     scripted, armed = robot_on(server), []
 

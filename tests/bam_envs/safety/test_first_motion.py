@@ -148,7 +148,7 @@ def driven(arm, initial=None, limits=None):
     return robot, None
 
 
-UNITS = (1.0, -1.0, 180 / np.pi, -180 / np.pi, np.pi / 180, 1000.0, 0.001, 2.0, 0.5, 1.1)
+UNITS = (1.0, -1.0, 180 / np.pi, -180 / np.pi, np.pi / 180, 1000.0, 0.001, 10.0, 0.1, 0.2, -0.2, 2.0, 0.5, 1.1)
 
 
 def wirings(scales):
@@ -182,7 +182,7 @@ class BusyArm(WiredArm):
 
 EACH = st.lists(st.sampled_from(UNITS), min_size=6, max_size=6)
 # A joint that is measured much smaller than it is shows no motion before it is large.
-SHOWN = st.lists(st.sampled_from([one for one in UNITS if abs(one) >= 0.5]), min_size=6, max_size=6)
+SHOWN = st.lists(st.sampled_from([one for one in UNITS if abs(one) >= 0.2]), min_size=6, max_size=6)
 BUSY = st.fixed_dictionaries(
     {
         "lag": st.sampled_from([0.0, 0.03, 0.1]),
@@ -312,11 +312,11 @@ def test_radians_that_are_taken_for_degrees_are_found_before_anything_moves():
     assert arm.now == 0.0
 
 
-def test_an_arm_that_ignores_everything_is_named_within_three_seconds():
-    for known in (False, True):
-        arm = WiredArm(stuck=range(6), known=known)
-        assert driven(arm)[1] is not None
-        assert arm.now <= 3.0
+@pytest.mark.parametrize(("known", "seconds"), [(False, 5.0), (True, 3.0)])
+def test_an_arm_that_ignores_everything_is_named_soon(known, seconds):
+    arm = WiredArm(stuck=range(6), known=known)
+    assert driven(arm)[1] is not None
+    assert arm.now <= seconds
 
 
 def test_positions_that_are_executed_at_once_are_not_sent_unproved():
@@ -339,12 +339,22 @@ def test_an_arm_that_sags_under_its_load_is_proved_where_its_limits_allow_for_it
     assert load_profile("ros2_so_arm100").limits == {"follow_tolerance": 0.03}
 
 
-@pytest.mark.parametrize(("scale", "farthest"), [(0.9, 0.01), (0.5, 0.01)])
-@pytest.mark.parametrize("at", [0.1, 0.33, 1.0, -2.9])
-def test_one_joint_that_is_measured_smaller_than_it_is(scale, farthest, at):
-    arm = WiredArm(state=Wiring(scale=(1, 1, 1, 1, 1, scale)), start=[*HOME[:5], at])
-    assert "wrist_3_joint was commanded to stay where it is measured, and moved" in driven(arm)[1]
-    assert arm.farthest <= farthest
+@settings(max_examples=60, deadline=None)
+@given(
+    st.sampled_from(["command", "state"]),
+    st.sampled_from([0.1, -0.1, 0.5, 0.9, 2.0, 10.0, -10.0]),
+    st.integers(0, 5),
+    st.sampled_from([0.0, 0.1, 0.33, 1.0, -2.9]),
+    BUSY,
+)
+def test_one_joint_that_is_measured_or_commanded_smaller_or_larger_than_it_is(side, scale, joint, at, busy):
+    scales, start = [1.0] * 6, np.array([0.0, -1.57, 1.57, 0.3, 1.57, 0.0])
+    scales[joint], start[joint] = scale, at
+    slider = 1.0 if abs(scale) < 0.2 else busy["slider"]
+    arm = BusyArm(**{side: Wiring(scale=scales)}, start=start, **{**busy, "slider": slider})
+    _, why = driven(arm)
+    assert why is not None
+    assert arm.farthest <= MOST
     assert arm.fastest <= FASTEST
 
 

@@ -1,6 +1,7 @@
 """Which version acts: candidates that come, are promoted, rolled back, or refused while the old one acts on."""
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -32,9 +33,12 @@ class Agent:
         self.session = SimpleNamespace(env_id=env, env_kwargs={}, interface=interface, is_real=False, identity="")
         self.succession, self.sent, self.notes = Succession(self, versions), [], []
         self.answered, self.state, self.why = threading.Event(), State.TRIAL, ""
+        self.on_progress = lambda text: None
 
     def send(self, message):
         self.sent.append(message)
+        if isinstance(message, RequestProgress):
+            self.on_progress(message.text)
         if hasattr(message, "kind"):
             self.answered.set()
 
@@ -177,10 +181,42 @@ def test_a_refused_candidate_changes_nothing(agent, better):
     assert agent.notes == [("refused", f"better.zip: {why}")]
     assert not better.exists()
     assert agent.succession.names == before
-    agent.session = None
+
+
+def test_a_push_waits_a_little_for_a_robot_that_is_away(agent, better, monkeypatch):
+    path, session, agent.session, agent.why = better.read_bytes(), agent.session, None, "no state came."
+
+    def come_back(text):
+        if text == "waits at most 20 s for the robot: no state came":
+            agent.session = session
+
+    agent.on_progress = come_back
+    assert agent.ask("push", path=str(better)).error == ""
+    assert agent.succession.is_candidate
+    better.write_bytes(path)
+    agent.session, agent.on_progress = None, lambda text: None
+    monkeypatch.setattr("bam_train.agent.succession.ROBOT_TIMEOUT", 0.0)
     answer = agent.ask("push", path=str(better))
-    why = "the agent waits for the robot, and checks no candidate without it; push it later"
+    why = "the agent has waited 0 s for the robot, and checks no candidate without it; push it later: no state came"
     assert (answer.kind, answer.error) == ("RequestRefused", why)
+
+
+def test_a_real_robot_that_is_lost_during_a_check_stays_a_real_one(agent, better):
+    """Its candidate acts as a trial when it is there again, and at full speed only with enough trials."""
+    real = SimpleNamespace(**{**vars(agent.session), "is_real": True, "identity": "serial number 7"})
+    agent.options = replace(agent.options, allow_unsigned=True)
+
+    def lose(text):
+        agent.session = None
+
+    content, agent.on_progress = better.read_bytes(), lose
+    for stage, kind in (("full", "TrialsNeeded"), ("auto", "")):
+        better.write_bytes(content)
+        agent.session = real
+        assert agent.ask("push", path=str(better), stage=stage).kind == kind
+    assert agent.succession.choice.stage == "trial"
+    agent.succession.trials().begin(3)
+    assert "serial number 7" in (agent.options.folder / "trials.jsonl").read_text()
 
 
 def test_a_version_of_another_environment_does_not_act(tmp_path, agent):
