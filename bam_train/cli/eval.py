@@ -278,7 +278,7 @@ def _record(config: EvalConfig, subject: _Subject, path: Path) -> None:
     env = make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")
     with closing(env), open_video(path, 1 / (control_period(env) or 1 / 30)) as add:
         count = record_video(env, subject.policy, add, episodes=episodes, seed=config.seed)
-    say(f"bam-eval: {path}: {episodes} episode{'' if episodes == 1 else 's'}, {count} pictures")
+    say(f"bam-eval: the video is {path}: {episodes} episode{'' if episodes == 1 else 's'}, {count} pictures")
 
 
 main = partial(run_program, "bam-eval", "bam_train.cli.flags:EvalConfig", lambda config, _: evaluate_checkpoint(config))

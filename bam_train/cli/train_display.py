@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 LINE_EVERY = 1.0
 """Minimum seconds between two plain lines about training."""
 UNKNOWN = "not known yet"
-"""The time left before it can be estimated."""
+"""The time of training left, without evaluations, before it can be estimated."""
 
 
 class MayClose:
@@ -65,7 +65,7 @@ class PlainDisplay:
             return
         self._printed = self._clock()
         success = "" if statistics.success_rate is None else f"success {percent(statistics.success_rate)}  "
-        rest = f"time left: {UNKNOWN}" if left is None else f"at most {duration(max(0.0, left))} left"
+        rest = f"training left: {UNKNOWN}" if left is None else f"at most {duration(max(0.0, left))} of training left"
         what = f"{success}return {number(statistics.return_mean)}"
         self.note(f"{_steps(progress)}  {speed:,.0f} steps/s  {what}  {rest}")
 
@@ -109,7 +109,7 @@ class LiveDisplay(PlainDisplay):
             "speed": f"{speed:,.0f} steps/s",
             "success": percent(statistics.success_rate),
             "return": number(statistics.return_mean),
-            "time left, at most": UNKNOWN if left is None else duration(max(0.0, left)),
+            "training left, at most": UNKNOWN if left is None else duration(max(0.0, left)),
         }
         figures = Table.grid(padding=(0, 3))
         figures.add_row(*columns, style="dim")

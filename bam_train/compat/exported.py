@@ -64,6 +64,13 @@ def exported(
     Raises:
         PolicyError: It acts otherwise.
     """
+    finite = np.isfinite(golden["action"]).reshape(len(golden["action"]), -1).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        found = golden["action"][row].ravel()
+        text = f"{checked_by} computes {found[~np.isfinite(found)][0]} for an observation like those of its data"
+        remedy = "Its weights are damaged, or a mean or std of its inputs is wrong: correct that, or train it again"
+        raise PolicyError(f"{place}: {text} (row {row}). {remedy}")
     worst, row = policy.worst_difference(golden)
     if not worst <= TOLERANCE:  # NaN too
         text = f"its frozen policy differs by {worst:.3g} in row {row} from the actions of {checked_by}"

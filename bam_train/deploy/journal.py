@@ -211,7 +211,7 @@ class DeployReport:
             *([guards_text(self.guards, self.pacer.ticks)] if self.guards else []),
             *([self.trials.evidence.text] if self.trials else []),
             *([self.shadow.agreement.text] if self.shadow else []),
-            *([f"recorded in {self.recorder.path}"] if self.recorder is not None else []),
+            *([recorded_text(self.recorder)] if self.recorder is not None else []),
         ]
 
 
@@ -226,6 +226,11 @@ def lateness_text(pacer: Pacer) -> str:
     late = _milliseconds(pacer.lateness)
     figures = [f"{name} {value:.2f} ms" for name, value in late.items()] if late else ["none yet"]
     return ", ".join([*figures, f"{pacer.missed or 'no'} deadline{'s' if pacer.missed > 1 else ''} missed"])
+
+
+def recorded_text(recorder: Recorder) -> str:
+    """Where the recording is, and whether it failed."""
+    return f"not recorded to the end: {recorder.fault}" if recorder.fault else f"recorded in {recorder.path}"
 
 
 def guards_text(guards: Mapping[str, Mapping[str, Any]], ticks: int) -> str:

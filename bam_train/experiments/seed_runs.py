@@ -239,10 +239,10 @@ class SeedRun:
     """``waiting``, ``training``, ``stopped``, ``failed`` or ``done``."""
     steps: int = 0
     success: float | None = None
-    """Success rate of the last evaluation; of training, as long as there is none."""
+    """Success rate of the last evaluation; None as long as there is none."""
     returns: float | None = None
     left: float | None = None
-    """Longest time that it may still take [s]."""
+    """Longest time that it may still train [s]."""
     why: str = ""
     """Why it has ended."""
     evaluations: list[dict[str, Any]] = field(default_factory=list)
@@ -272,7 +272,6 @@ class SeedRun:
             self.steps = record["steps"]
             if record["kind"] == "evaluation":
                 self.evaluations = [*(one for one in self.evaluations if one["steps"] < self.steps), record]
-            if record["kind"] == "evaluation" or not self.evaluations:
                 self.success, self.returns = record.get("success_rate"), record.get("return_mean")
             if speed := record.get("steps_per_second"):
                 self.left = max(0.0, (self.settings.steps - self.steps) / speed)

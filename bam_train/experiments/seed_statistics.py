@@ -59,16 +59,16 @@ def difference(values: Array, others: Array, matched: bool) -> Interval:
     return _interval(found, drawn, _seeds(len(values), len(others), matched), (-np.inf, np.inf))
 
 
-def improvement(values: Array, others: Array, matched: bool) -> Interval:
-    """Probability that a run of `values` is better than one of `others`; equal ones count half.
+def improvement(values: Array, others: Array, matched: bool) -> Interval | None:
+    """Probability that a run of `values` is better than one of `others`; None with fewer runs than `FEWEST`.
 
-    Over pairs of the same seed if `matched`, else over all pairs. The interval is Wilson's, for as many independent
-    pairs as the smaller number of runs: the variance over all pairs is at most that (Birnbaum, 1956).
+    Over pairs of the same seed if `matched`, else over all pairs; equal ones count half. The interval is Wilson's, for
+    as many independent pairs as the smaller number of runs: the variance over all pairs is not more (Birnbaum, 1956).
     """
     pairs = values - others if matched else values[:, None] - others[None, :]
     share = float(np.mean((pairs > 0) + (pairs == 0) / 2))
     n = min(len(values), len(others))
-    return Interval(share, *wilson_interval(share * n, n)) if n >= FEWEST else Interval(share)
+    return Interval(share, *wilson_interval(share * n, n)) if n >= FEWEST else None
 
 
 def bands(curves: Array, within: tuple[float, float] = (-np.inf, np.inf)) -> tuple[Array, Array, Array]:

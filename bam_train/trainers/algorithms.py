@@ -165,6 +165,10 @@ def require_algorithm(trainer: str, algorithm: str) -> None:
     table = ALGORITHMS[trainer]
     if algorithm not in table:
         others = [name for name, algorithms in ALGORITHMS.items() if algorithm in algorithms]
+        if trainer == "offline" and "sb3" in others:
+            choices = ", ".join(sorted(table))
+            text = f"{algorithm} learns in the environment, and not from a data set. Leave --data out"
+            raise SettingsError(f"{text}, or choose from: {choices}.")
         if others:
             hint = f"It is one of {others[0]}'s; those of {trainer} are: {', '.join(sorted(table))}."
         else:

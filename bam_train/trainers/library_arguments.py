@@ -105,11 +105,12 @@ def require_known(
     for name in given:
         if name in known:
             continue
-        if name not in elsewhere:
+        if name not in elsewhere and name not in others:
             raise SettingsError(
                 f"Unknown {what} {name!r}. {did_you_mean(name, [*known, *others], examples=sorted(known))}"
             )
-        raise SettingsError(f"{name} is not a hyperparameter here: {elsewhere[name]}")
+        own = "it is a setting of the run; give it beside the hyperparameters, not among them"
+        raise SettingsError(f"{name} is not a hyperparameter here: {elsewhere.get(name, own)}")
 
 
 # The source

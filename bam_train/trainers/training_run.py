@@ -117,6 +117,7 @@ class TrainingRun:
         self._seconds_before = max((one["seconds"] for one in before), default=0.0)  # in a folder of the run
         self._save_pause = FIRST_SAVE
         self._learning_from: tuple[int, float] | None = None  # steps and time when the trainer had first learnt
+        self._evaluating = 0.0  # time that evaluations took [s]
         self._stop, self._reached = False, ""
         self._evaluated_at = trainer.steps if best or any(one["kind"] == "evaluation" for one in before) else 0
         self._scores: Scores = {}  # the newest evaluation
@@ -259,17 +260,17 @@ class TrainingRun:
             self._first_return = statistics.return_mean
         rate = (progress.steps - self._first_step) / max(now - self._start, 1e-9)
         if statistics.metrics and self._learning_from is None:
-            self._learning_from = progress.steps, now
-        left = self._time_left(progress, now)
+            self._learning_from = progress.steps, now - self._evaluating
+        left = self._time_left(progress, now - self._evaluating)
         figures = asdict(statistics)
         metrics = figures.pop("metrics")
         self._add("training", progress.steps, {"steps_per_second": round(rate, 1), **figures, **metrics})
         self.watcher.training(progress, statistics, rate, left)
 
     def _time_left(self, progress: Progress, now: float) -> float | None:
-        """The longest time that the run may still take [s], at its speed since it has learnt; None if that is new.
+        """The longest time that training may still take [s], at its speed since it has learnt; None if that is new.
 
-        Steps are quick before the first update, while a replay buffer fills.
+        Evaluations come on top. Steps are quick before the first update, while a replay buffer fills.
         """
         if self._learning_from is None:
             return None
@@ -285,10 +286,12 @@ class TrainingRun:
             self._scores = {"steps": steps}
             self._keep()
             return
+        before = self._clock()
         with self.trainer.undisturbed(), self.trainer.evaluation_envs() as envs:
             last = steps >= self.settings.steps
             found = evaluate_for_goal(self.trainer.freeze(), self.settings, last=last, envs=envs)
             report, self._reached, played = found
+        self._evaluating += self._clock() - before
         if report.success_rate is None and self.settings.until_success is not None and not self._scores:
             self.watcher.note(f"{self.settings.env} reports no is_success, so --until-success has no effect")
         self._scores = {**report.to_json(), "steps": steps}

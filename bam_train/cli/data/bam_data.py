@@ -206,24 +206,21 @@ def merge_data(config: flags.MergeConfig) -> None:
 
 def split_data(config: flags.SplitConfig) -> None:
     """Split a data set."""
-    from bam_train.data.selection import copy_episodes, split
+    from bam_train.data.selection import split
     from bam_train.errors import SettingsError
 
     if config.out == config.rest:
         raise SettingsError(f"--rest: expected another place than --out, found {config.rest}")
     data = _open(config.place)
-    parts = dict(zip((config.out, config.rest), split(data, config.share, config.by), strict=True))
-    for place, added in zip(parts, copy_episodes(data, parts), strict=True):
-        _tell_added(place, *added)
+    _copy(data, dict(zip((config.out, config.rest), split(data, config.share, config.by), strict=True)))
 
 
 def filter_data(config: flags.FilterConfig) -> None:
     """Copy some episodes."""
-    from bam_train.data.selection import choose, copy_episodes
+    from bam_train.data.selection import choose
 
     data = _open(config.place)
-    chosen = choose(data, config.where)
-    _tell_added(config.out, *copy_episodes(data, {config.out: chosen})[0])
+    _copy(data, {config.out: choose(data, config.where)})
 
 
 def show_stats(config: flags.StatsConfig) -> None:
@@ -236,7 +233,9 @@ def show_stats(config: flags.StatsConfig) -> None:
     if config.json:
         tell(json.dumps({"place": config.place, "groups": by_group, "numbers": each}))
         return
-    table = [[config.by or "", "episodes", "steps", "success (95 %)", "mean return", "deviation", "mean length"]]
+    table = [
+        [config.by or "", "episodes", "steps", "success (95 %)", "mean return", "deviation", "mean length [steps]"]
+    ]
     for row in by_group:
         values = [number(row[key]) for key in ("mean_return", "std_return", "mean_length")]
         table.append([row["group"][:40], str(row["episodes"]), str(row["steps"]), _success(row), *values])
@@ -244,6 +243,8 @@ def show_stats(config: flags.StatsConfig) -> None:
     keys = ("min", "q01", "q50", "q99", "max", "mean", "std")
     rows = [[one["column"], one["name"], one["unit"], *(number(one[key]) for key in keys)] for one in each]
     tell(*aligned([["column", "name", "unit", *keys], *rows]))
+    if any(one["unit"] == "scaled" for one in each):
+        tell("", f"scaled: the task has divided it, so that it is about -1 to 1; see bam-envs {data.info.env}")
 
 
 def plot_data(config: flags.PlotConfig) -> None:
@@ -302,6 +303,18 @@ def _episodes(how_many: int) -> str:
     return f"{how_many} episode{'' if how_many == 1 else 's'}"
 
 
+def _copy(data: DataSet, parts: dict[str, Sequence[int]]) -> None:
+    """Add the episodes of these indices to the data set at each place; say what else was in it."""
+    from bam_train.data.selection import copy_episodes
+
+    for (place, chosen), added in zip(parts.items(), copy_episodes(data, parts), strict=True):
+        _tell_added(place, *added)
+        others = len({*_open(place).digests} - {data.digests[i] for i in chosen})
+        if others:
+            text = f"{place} has {_episodes(others)} from before that this call does not choose"
+            say(f"bam-data: note: {text}; if another choice made it, write into a new place")
+
+
 def _tell_added(place: str, added: int, left_out: int) -> None:
     more = f"; {left_out} left out, which are in it already" if left_out else ""
     tell(f"{place}: {_episodes(added)} added{more}")
@@ -311,7 +324,7 @@ def _success(row: dict[str, Any]) -> str:
     if row["success"] is None:
         return "not known"
     low, high = row["success_interval"]
-    return f"{percent(row['success'])} ({100 * low:.1f} to {100 * high:.1f})"
+    return f"{percent(row['success'])} ({percent(low)} to {percent(high)})"
 
 
 main = partial(run_commands, "bam-data", WHAT, COMMANDS)

@@ -131,7 +131,13 @@ def _status(every: list[SeedRun]) -> int:
 # Display
 
 
-_WORDS = {"state": "{}", "steps": "{} steps", "success": "success {}", "return": "return {}", "time left": "{} left"}
+_WORDS = {
+    "state": "{}",
+    "steps": "{} steps",
+    "success": "success {}",
+    "return": "return {}",
+    "training left": "{} of training left",
+}
 """The cells of `_cells` in a plain line."""
 
 
@@ -145,7 +151,7 @@ def _cells(run: SeedRun) -> dict[str, str]:
         "steps": f"{count(run.steps)}{more}" if run.steps else "-",
         "success": percent(run.success),
         "return": number(run.returns),
-        "time left": "-" if run.left is None else f"at most {duration(run.left)}",
+        "training left": "-" if run.left is None else f"at most {duration(run.left)}",
     }
 
 

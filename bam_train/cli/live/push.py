@@ -21,17 +21,24 @@ if TYPE_CHECKING:
 _GATE = "from bam_train.cli.data.run_gate import main; main()"
 _PASSED = (0, 1)
 """Exit statuses of bam-gate for "better" and "not worse"."""
+ACTS = "acts already: there is nothing to do"
 ROLLED_BACK = 5
 """Exit status when the candidate was rolled back, or replaced before its trials were done."""
 
 
 def push(config: PushConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags; returns the exit status."""
+    from bam_train.checkpoint import Checkpoint
+
     path, url = _arguments(config)
 
     def do(agent: AgentClient) -> dict[str, Any]:
         if path is None:
             return {**agent.ask("rollback", why=config.why), **agent.ask("status")}
+        digest, status = Checkpoint.open(path).digest, agent.ask("status")
+        names = status.get("names") or {}
+        if status["active"] == digest and names.get("champion") == digest:
+            return {**status, "digest": digest, "outcome": ACTS}
         if config.gate is not None:
             _pass_gate(agent, path, config.gate)
         choice: dict[str, Any] = {"stage": config.stage, "when": config.when, "wait": config.wait, "why": config.why}
@@ -47,7 +54,7 @@ def push(config: PushConfig, signals: SignalMemory) -> int:
             *(f"  {line}" for line in result.get("lines") or ()),
             *status_lines(result),
         )
-    if config.wait and outcome and not outcome.startswith("promoted"):
+    if config.wait and outcome and not outcome.startswith(("promoted", ACTS)):
         say(f"bam-push: {outcome}")
         return ROLLED_BACK
     return 0

@@ -16,6 +16,7 @@ import numpy as np
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady, ProtocolError, StaleState
 from bam_envs.core.location import LiveRobot, is_loopback
 from bam_envs.core.robot_models import known_models
+from bam_envs.core.wording import listed
 from bam_envs.live import bringup
 from bam_envs.live.building import live_robot, require_robot_address
 from bam_envs.live.examination import PING_TOPIC, Array, Inspection, Reading, inspect_robot
@@ -38,6 +39,7 @@ MAX_CLOCK_OFFSET = 1.0
 """Offset of the server's clock above which a step warns [s]."""
 LOSS_WARNING, LOSS_FAILURE = 0.05, 0.10
 """Share of lost pings above which a step warns, and above which it fails."""
+SCAN = "sensor_msgs/LaserScan"
 _HANDSHAKE = 2**20
 """Maximum message size of the connection that tests the handshake [bytes]."""
 Verdict = Literal["ok", "warning", "failed"]
@@ -90,6 +92,7 @@ class Diagnosis:
             self.profile = robot.profile or profile_for(robot.spec)
         self._link = RosbridgeLink(endpoint, name="doctor")
         self._timeout = endpoint.timeout or bringup.TIMEOUT
+        self._simulated = False  # as the robot says
 
     def steps(self, *more: tuple[str, Callable[[Inspection], Findings | None]]) -> Iterator[DiagnosisStep]:
         """Run the steps in order, up to the first failure; then `more` of them, which look at the inspection.
@@ -138,6 +141,7 @@ class Diagnosis:
         ros, info = self._link.ros, bringup.robot_info(self._link)
         found = ["answers" + ("" if ros is None else f" as ROS {ros[-1]}")]
         if info is not None:
+            self._simulated = info.simulated
             found.append(f"the robot describes itself: {info.text or info.name}")
             if self.profile is None and own_profile(info.name) is not None:
                 self.profile = load_profile(info.name)
@@ -149,9 +153,15 @@ class Diagnosis:
 
     def _topics(self) -> Findings:
         profile, link = self._chosen_profile(), self._link
+        types, dark = bringup.TopicTypes(link, profile, self._timeout), list[str]()
         if self.robot is None:
-            self.robot = live_robot(replace(self._at, profile=profile))
-        types = bringup.TopicTypes(link, profile, self._timeout)
+            place = replace(self._at, profile=profile)
+            self.robot = live_robot(place)
+            if self._simulated:  # bam/navigation has its lasers off
+                spec, lasers = self.robot.spec, (source for source in profile.state if source.type == SCAN)
+                dark = [one.signal for one in lasers if types.answers and not types.type_of(link.namespace + one.topic)]
+                lit = tuple(signal for signal in spec.signals if signal.name not in dark)
+                self.robot = live_robot(place, replace(spec, signals=lit)) if dark else self.robot
         sources = [profile.source(signal.name) for signal in self.robot.spec.signals]
         topics = {source.topic: source.type for source in sources}
         for topic, kind in topics.items():
@@ -166,7 +176,8 @@ class Diagnosis:
                 )
         found = [f"profile {profile.name}: {', '.join(topics)}"]
         if types.answers:
-            return [*found, "all of the expected types"], []
+            off = [f"its lasers are off ({listed(dark)}), as for bam/navigation; bam/avoidance needs them"]
+            return [*found, "all of the expected types"], off if dark else []
         return found, ["the server has no rosapi node, so that types of topics cannot be checked"]
 
     def _chosen_profile(self) -> RobotProfile:

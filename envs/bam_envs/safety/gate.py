@@ -38,7 +38,7 @@ from bam_envs.safety.guard import (
     require_bounded,
 )
 from bam_envs.safety.guards import LATE, CommandShape, Freshness, MeasuredLimits, default_guards
-from bam_envs.safety.link_guards import TICKS, LateTicks, Share, Watchdog
+from bam_envs.safety.link_guards import LateTicks, Share, Watchdog
 from bam_envs.safety.unusual import UnusualObservations
 
 __all__ = ["ClearedCommand", "Limits", "SafeRobot"]
@@ -575,13 +575,13 @@ class SafeRobot(metaclass=Sealed):
     def _busy(self, tick: Tick) -> str:
         """What else can be behind a fault, as the end of a message: an old state, or late commands; empty for none."""
         period, what = self._spec.period, ""
-        late = next(guard.counted for guard in self._guards if isinstance(guard, LateTicks))
+        late = next(guard for guard in self._guards if isinstance(guard, LateTicks))
         if tick.age > period:
             what = f"the newest state was {tick.age:.2f} s old"
         elif tick.pause > LATE_COMMAND * period:
             what = f"the last command was sent {tick.pause:.2f} s ago"
-        elif late:
-            what = f"{late} of the last {TICKS} commands were late"
+        elif late.counted:
+            what = f"{late.counted} of the last {late.seen} commands were late"
         return what and f"; {what}: this computer or the link is busy"
 
     def _send(self, tick: Tick, halts: int) -> RobotState:

@@ -63,6 +63,11 @@ class Share(Guard):
         """Number of counted ticks among the last 100."""
         return len(self._counted)
 
+    @property
+    def seen(self) -> int:
+        """Number of ticks among which they are counted: 100, or fewer at first."""
+        return min(self._tick, TICKS)
+
     def fault(self, tick: Tick) -> str | None:
         """Count this tick, and report what `judge` does."""
         self._tick += 1
@@ -93,7 +98,7 @@ class LateTicks(Share):
         """Return None: this guard only warns."""
         if counted > TICKS * self.limit_value + 1e-9:
             self.warning = (
-                f"{counted} of the last {TICKS} commands were more than {1000 * self._by:.0f} ms late, and "
+                f"{counted} of the last {self.seen} commands were more than {1000 * self._by:.0f} ms late, and "
                 f"{TICKS * self.limit_value:g} may be: the robot moves unevenly, because the policy takes too long "
                 "or the computer is busy; end other programs, or use a faster policy"
             )
@@ -121,13 +126,13 @@ class LinkQuality(Share):
         if not counted:
             self.warning = ""
             return None
-        good = f"only {TICKS - counted} of the last {TICKS} ticks had a state and an answer in time"
+        good = f"only {self.seen - counted} of the last {self.seen} ticks had a state and an answer in time"
         self.warning = good if counted > TICKS * (1.0 - self._warn) + 1e-9 else ""
         if self._counted[-1] == self._tick or counted <= TICKS * (1.0 - self.limit_value) + 1e-9:
             return None
         return (
-            f"{good}, and {TICKS * self.limit_value:.0f} are needed: look at the load of this computer and of the "
-            "robot's, and at the network, or come nearer to its access point"
+            f"{good}, and {TICKS * (1.0 - self.limit_value):.0f} may lack them: look at the load of this computer and "
+            "of the robot's, and at the network, or come nearer to its access point"
         )
 
 
@@ -149,7 +154,7 @@ class ChangedCommands(Share):
         if not counted:
             self.warning = ""
             return None
-        text = f"{counted} of the last {TICKS} commands were changed to keep the robot out of a forbidden region"
+        text = f"{counted} of the last {self.seen} commands were changed to keep the robot out of a forbidden region"
         self.warning = text if counted > TICKS * self._warn + 1e-9 else ""
         if counted <= TICKS * self.limit_value + 1e-9:
             return None

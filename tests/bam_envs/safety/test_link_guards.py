@@ -50,7 +50,7 @@ def test_more_late_ticks_than_the_limit_are_a_warning_until_they_are_over():
         assert guard.warning == "", late
     guard.fault(tick_of(pause=0.06))
     assert guard.warning == (
-        "6 of the last 100 commands were more than 5 ms late, and 5 may be: the robot moves unevenly, because the "
+        "6 of the last 12 commands were more than 5 ms late, and 5 may be: the robot moves unevenly, because the "
         "policy takes too long or the computer is busy; end other programs, or use a faster policy"
     )
     guard.forgive()
@@ -70,12 +70,12 @@ def test_a_bad_link_is_a_warning_and_then_a_stop_when_it_is_back(good, bad):
     for number in range(1, 11):
         assert guard.fault(tick_of(**bad)) is None
         assert guard.fault(tick_of(**{"age": 0.0, **good})) is None
-        quality = f"only {100 - number} of the last 100 ticks had a state and an answer in time"
+        quality = f"only {number} of the last {2 * number} ticks had a state and an answer in time"
         assert guard.warning == (quality if number > 5 else "")
     assert guard.fault(tick_of(**bad)) is None, "others hold the robot while the link is down"
     assert guard.fault(tick_of(**good)) == (
-        "only 89 of the last 100 ticks had a state and an answer in time, and 90 are needed: look at the load of this "
-        "computer and of the robot's, and at the network, or come nearer to its access point"
+        "only 11 of the last 22 ticks had a state and an answer in time, and 10 may lack them: look at the load of "
+        "this computer and of the robot's, and at the network, or come nearer to its access point"
     )
     guard.restart()
     assert guard.fault(tick_of(**good)), "a motion that begins again does not make the link better"
@@ -88,10 +88,10 @@ def test_a_robot_that_is_kept_out_of_a_place_too_often_is_stopped():
     for number in range(1, 21):
         assert guard.fault(tick_of(kept_out=True)) is None
         assert guard.fault(tick_of(kept_out=False)) is None
-        changed = f"{number} of the last 100 commands were changed to keep the robot out of a forbidden region"
+        changed = f"{number} of the last {2 * number} commands were changed to keep the robot out of a forbidden region"
         assert guard.warning == (changed if number > 5 else "")
     assert guard.fault(tick_of(kept_out=True)) == (
-        "21 of the last 100 commands were changed to keep the robot out of a forbidden region, and 20 are allowed: the "
+        "21 of the last 41 commands were changed to keep the robot out of a forbidden region, and 20 are allowed: the "
         "report names the guards that changed them"
     )
     off = ChangedCommands(Limits(clamp_stop=1.0))
@@ -208,5 +208,5 @@ def test_a_standing_warning_has_the_title_of_its_guard():
     for _ in range(7):
         assert robot.warnings == ()
         robot.step(up)
-    text = "6 of the last 100 commands were changed to keep the robot out of a forbidden region"
+    text = "6 of the last 7 commands were changed to keep the robot out of a forbidden region"
     assert robot.warnings == (f"changed commands (G18): {text}",)

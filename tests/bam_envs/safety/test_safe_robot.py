@@ -704,7 +704,7 @@ def test_a_live_arm_that_is_there_is_sent_nothing():
         (0.05, 0.0, ""),
         (0.06, 0.0, "; the newest state was 0.06 s old: this computer or the link is busy"),
         (0.05, 0.03, "; the last command was sent 0.08 s ago: this computer or the link is busy"),
-        (0.05, 0.02, "; 12 of the last 100 commands were late: this computer or the link is busy"),
+        (0.05, 0.02, "; 12 of the last 13 commands were late: this computer or the link is busy"),
     ],
 )
 def test_a_joint_that_is_blocked_on_the_way_to_the_start_stops_the_arm(old, late, else_):

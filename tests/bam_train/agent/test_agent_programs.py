@@ -148,13 +148,23 @@ def test_push(hub, server, run):
     lines = out.splitlines()
     assert lines[:2] == ["3f2a91c0d7aa: accepted", "  signed by alice"]
     assert lines[3:] == LINES[1:]
-    arguments = dict(hub.asked[0][1])
+    arguments = dict(next(one for op, one, _ in hub.asked if op == "push"))
     assert not Path(arguments.pop("path")).exists()
     del arguments["sha256"]
     told = {"stage": "trial", "when": "tick", "wait": False, "file": "pick-ppo.zip", "why": "better"}
     assert arguments == {"size": PICK.stat().st_size, **told}
     status, out, _ = run(push.main, PICK, server.url, "--json")
     assert (status, json.loads(out)["active"]) == (0, DIGEST)
+
+
+def test_the_policy_that_acts_already_is_not_pushed_again(hub, server, run, monkeypatch):
+    digest = Checkpoint.open(PICK).digest
+    monkeypatch.setitem(STATUS, "active", digest)
+    monkeypatch.setitem(STATUS, "names", {"champion": digest})
+    status, out, err = run(push.main, PICK, server.url, "--wait", "--gate", REACH)
+    assert (status, err) == (0, "")
+    assert out.splitlines()[0] == f"{digest[:12]}: acts already: there is nothing to do"
+    assert [op for op, _, _ in hub.asked] == ["status"]
 
 
 @pytest.mark.parametrize(
@@ -167,7 +177,7 @@ def test_push_that_waits(hub, server, run, outcome, status):
     assert (code, out.splitlines()[0]) == (status, f"3f2a91c0d7aa: {outcome}")
     assert out.splitlines()[2].startswith("running for ")  # what it led to, not the trial that is over
     assert err.splitlines()[1:] == ([f"bam-push: {outcome}"] if status else [])
-    assert hub.asked[0][1]["wait"] is True
+    assert [one["wait"] for op, one, _ in hub.asked if op == "push"] == [True]
 
 
 @pytest.mark.parametrize(

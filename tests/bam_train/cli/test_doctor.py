@@ -122,6 +122,15 @@ def test_flags_that_are_refused(run, flags, text):
     assert len(err.splitlines()) == 1
 
 
+def test_a_simulated_base_may_have_its_lasers_off(run):
+    base = gym.make("bam/navigation-v0", disable_env_checker=True)
+    with ServedEnvironment(base, ServeOptions(port=0, fast=True)) as one:
+        status, out, err = run(doctor, one.bus.url, "--seconds", 0.1)
+    assert (status, err) == (0, "")
+    note = "warning: its lasers are off (f_scan, b_scan), as for bam/navigation; bam/avoidance needs them"
+    assert note in (line.strip() for line in out.splitlines())
+
+
 def test_the_urdf_of_a_described_arm_is_compared_with_that_of_the_profile_or_of_a_flag(run, tmp_path):
     fr3 = gym.make("bam/pick-v0", robot_model="fr3", disable_env_checker=True)
     with ServedEnvironment(fr3, ServeOptions(port=0, fast=True)) as one:

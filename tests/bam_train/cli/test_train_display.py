@@ -29,11 +29,13 @@ def test_plain_lines_about_once_a_second(capsys):
         for _ in range(5):
             display.training(progress(12_288), statistics(0.5), 5164.3, 55.7)
             now[0] += 0.6
-    expected = "12.29k of 300k steps  5,164 steps/s  success 50 %  return 1.235  at most 55.7 s left"
+    expected = "12.29k of 300k steps  5,164 steps/s  success 50 %  return 1.235  at most 55.7 s of training left"
     assert capsys.readouterr() == ("", "\n".join(["ppo on bam/pick-v0", expected, expected, expected, ""]))
 
 
-@pytest.mark.parametrize(("left", "text"), [(-0.6, "at most 0.0 s left"), (None, "time left: not known yet")])
+@pytest.mark.parametrize(
+    ("left", "text"), [(-0.6, "at most 0.0 s of training left"), (None, "training left: not known yet")]
+)
 def test_without_success_and_past_the_end(capsys, left, text):
     PlainDisplay("").training(progress(303_104), statistics(None), 5000.0, left)
     assert capsys.readouterr().err == f"303.1k steps  5,000 steps/s  return 1.235  {text}\n"
@@ -63,6 +65,6 @@ def test_a_terminal_gets_a_panel(monkeypatch):
         display.evaluated(12_288, REPORT, best=True)
     shown = stream.getvalue()
     title = "ppo on bam/pick-v0, seed 0"
-    for words in (title, "12.29k of 300k steps", "5,164 steps/s", "50 %", "time left, at most", "55.7 s", "97 %"):
+    for words in (title, "12.29k of 300k steps", "5,164 steps/s", "50 %", "training left, at most", "55.7 s", "97 %"):
         assert words in shown
     assert "[dim]" not in shown

@@ -190,6 +190,18 @@ def test_a_description_that_says_too_little_is_one_line(described, run, change, 
     assert err.startswith(f"bam-export: {path}: does not describe a policy: {message}")
 
 
+def test_a_policy_that_gives_no_numbers_is_refused(described, run, tmp_path):
+    path = described(("mean = [1.0, ", "mean = [nan, "))
+    text = "onnxruntime computes nan for an observation like those of its data (row 0). Its weights are damaged, or a "
+    remedy = "mean or std of its inputs is wrong: correct that, or train it again"
+    assert run(main, path, "--robot-model", "so101", "--out", tmp_path / "act.zip") == (
+        1,
+        "",
+        f"bam-export: {path}: {text}{remedy}\n",
+    )
+    assert not (tmp_path / "act.zip").exists()
+
+
 def test_a_network_without_its_description(run, tmp_path):
     path = tmp_path / "act.onnx"
     path.write_bytes(b"\x93")

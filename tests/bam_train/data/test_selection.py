@@ -93,6 +93,9 @@ def test_programs(tmp_path, monkeypatch, run):
         "d: 6 episodes added; 5 left out, which are in it already\n",
         "",
     )
+    note = "bam-data: note: c has 2 episodes from before that this call does not choose; if another choice made it, "
+    again = (0, "c: 1 episode added; 1 left out, which are in it already\n", f"{note}write into a new place\n")
+    assert run(main, "filter", "a", "--out", "c", "--where", "index<2") == again
     taken = "bam-data split: a: is read and cannot be written too; choose another place\n"
     assert run(main, "split", "a", "--out", "train", "--rest", "a") == (1, "", taken)
     assert not (tmp_path / "train").exists()

@@ -1,5 +1,7 @@
 import json
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from bam_train.deploy.journal import (
     lateness_text,
     rate_text,
 )
+from bam_train.recording.recorder import Recorder
 
 
 class Clock:
@@ -91,6 +94,15 @@ def test_lines(corridor_checkpoint):
     assert first == "episodes done: 2 of 3 episodes, 1 success, 4 ticks, 11.03 Hz of 20"
     assert second.startswith("lateness p50 1.00 ms, p99 ")
     assert second.endswith(" ms, max 121.00 ms, 2 deadlines missed")
+
+
+def test_a_recording_that_failed_is_not_called_whole(corridor_checkpoint):
+    recorder = Recorder(Path("a.mcap"))
+    report = DeployReport(Checkpoint.open(corridor_checkpoint()), 0, Ending("x", 0), journal(), driven_pacer(0.05))
+    assert replace(report, recorder=recorder).lines()[-1] == "recorded in a.mcap"
+    recorder.tick([np.zeros(2)])  # none was declared
+    assert recorder.fault == "a.mcap: a tick has 2 numbers, and 0 were declared"
+    assert replace(report, recorder=recorder).lines()[-1] == f"not recorded to the end: {recorder.fault}"
 
 
 def test_before_the_first_tick(corridor_checkpoint):

@@ -36,7 +36,7 @@ def test_the_middle_half_counts(values, mean):
 
 def test_fewer_than_three_seeds_have_no_interval():
     assert estimate([1.0, 2.0]) == Interval(1.5)
-    assert improvement(np.array([1.0, 2.0]), np.array([0.0, 0.0]), True) == Interval(1.0)
+    assert improvement(np.array([1.0, 2.0]), np.array([0.0, 0.0]), True) is None
     assert difference(np.array([3.0, 4.0]), np.array([1.0, 1.0]), False) == Interval(2.5)
 
 

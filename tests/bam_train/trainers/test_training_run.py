@@ -35,6 +35,7 @@ class Counter:
         self.evaluations = "choose"
         self.saved, self.refuse, self.logged, self.notices, self.news = [], [], [], [], []
         self.fails_at, self.failure, self.statistics, self.rows = None, None, STATISTICS, None
+        self.evaluation_takes = 0.0
         self.learns_from = 0  # steps up to which it only collects, five times as fast
 
     def train(self, steps, on_progress):
@@ -97,6 +98,7 @@ def start(tmp_path, monkeypatch):
             assert env is trainer.rows
             start.seeds.append((policy.steps, seed, episodes))
             start.most_failures = most_failures
+            trainer.now += trainer.evaluation_takes
             found = results[policy.steps]
             return found.pop(0) if isinstance(found, list) else found
 
@@ -125,9 +127,11 @@ def test_evaluations_are_due_every_so_many_steps_and_at_the_end(start):
     assert trainer.logged[0] == {"eval/return_mean": 0.0, "eval/success_rate": 0.1}
 
 
-def test_the_time_left_is_not_known_before_the_trainer_has_learnt_for_a_while(start):
-    run, trainer, watcher = start({100: report(0.5)}, eval_every=1000)
-    trainer.learns_from = 40
+@pytest.mark.parametrize("every", [1000, 50])
+def test_the_time_of_training_left_is_not_known_before_the_trainer_has_learnt_for_a_while(start, every):
+    """It leaves out the time of evaluations, which say themselves that they are made."""
+    run, trainer, watcher = start({50: report(0.5), 100: report(0.5)}, eval_every=every)
+    trainer.learns_from, trainer.evaluation_takes = 40, 7.0
     run.run()
     left = {10: None, 20: None, 30: None, 40: None, 50: None, 60: None, 70: None, 80: 2.0, 90: 1.0, 100: 0.0}
     assert {steps: seconds for steps, _, seconds in watcher.rates} == pytest.approx(left)

@@ -9,6 +9,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -227,7 +228,7 @@ class ServedRobot:
             place = getattr(self._robot, "place_object", None)
             if self.state is None or (place is None and pose is not None):
                 raise RemoteError(f"{self.spec.name} has no object that could be placed.")
-            self.state = self.state if place is None else place(pose, seeds)
+            self.state = self.state if place is None else self._stood(place(pose, seeds))
 
     def halt(self) -> None:
         """Rest at the current position, or at speed zero. Time continues, and a waiting step ends in time."""
@@ -239,6 +240,18 @@ class ServedRobot:
                 return
             self._drop_parts()
             self._target, self.resting, self._behind = self._rest(self.state), True, 0.0
+            self.state = self._stood(self.state)
+
+    def _stood(self, state: RobotState) -> RobotState:
+        """The state with speed zero where the robot rests and its time stands still, so that no speed would end."""
+        if self.realtime or not self.resting:
+            return state
+        speeds = {
+            one.name: state.signals[one.name] * [not unit.endswith("/s") for unit in one.units]
+            for one in self.spec.signals
+            if any(unit.endswith("/s") for unit in one.units)
+        }
+        return replace(state, signals={**state.signals, **speeds})
 
     def _rest(self, state: RobotState) -> Array:
         """The command that keeps a halted robot at rest. Shape: (n, m)."""

@@ -226,6 +226,20 @@ def test_halt_stops_at_once_and_again_changes_nothing(serve, hands):
     np.testing.assert_array_equal(served.target(), rest)
 
 
+def test_a_robot_in_lockstep_has_the_speed_of_its_step_until_it_rests(serve):
+    """No time passes any more, in which it would come to rest."""
+    served = serve(SimulatedArm(1))
+    moved = served.step(command(0.05))
+    assert np.abs(moved.signals["joint_velocity"]).max() > 0.01
+    assert served.state is moved
+    served.halt()
+    placed = served.state
+    served.place_object(np.array([[0.5, 0.0, 0.0]]), ROWS)
+    for state in (placed, served.state):
+        np.testing.assert_array_equal(state.signals["joint_velocity"], np.zeros((1, 6)))
+    np.testing.assert_array_equal(placed.signals["joint_position"], moved.signals["joint_position"])
+
+
 def test_after_the_command_timeout_a_closed_gripper_keeps_holding_and_a_base_rests_at_zero_speed(serve, hands):
     served = serve(SimulatedArm(1), realtime=True)
     for _ in range(10):

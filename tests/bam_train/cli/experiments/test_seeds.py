@@ -13,7 +13,7 @@ import pytest
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.experiments import seeds
 from bam_train.errors import OutputError
-from bam_train.experiments.seed_runs import News, group_folder
+from bam_train.experiments.seed_runs import News, SeedRun, group_folder
 from bam_train.settings import TrainSettings
 from bam_train.trainers.run_folder import RunFolder, read_records
 
@@ -97,6 +97,16 @@ def test_the_summary_and_a_second_call_that_does_what_is_missing(bam_train, monk
     assert err.splitlines()[1:3] == ["seed 1: failed: again", "seed 4: failed: again"]
     assert Path("runs/CartPole-v1-ppo/config.json").read_text() == '{"seed": 0}'
     assert sorted(one.name for one in Path("runs").iterdir()) == ["CartPole-v1-ppo", "CartPole-v1-ppo-2"]
+
+
+def test_success_and_return_are_those_of_an_evaluation(here):
+    """A training record before it may be of a single episode."""
+    run = SeedRun(TrainSettings(env="CartPole-v1", algo="ppo", steps=1024), RunFolder(Path("runs"), "seed-0"))
+    record = {"kind": "training", "steps": 64, "success_rate": 1.0, "return_mean": 9.0, "steps_per_second": 64.0}
+    run.take([record])
+    assert (run.success, run.returns, run.left) == (None, None, 15.0)
+    run.take([{"kind": "evaluation", "steps": 64, "success_rate": 0.25, "return_mean": 3.0}, {**record, "steps": 128}])
+    assert (run.success, run.returns, run.left) == (0.25, 3.0, 14.0)
 
 
 def test_two_calls_do_not_train_the_same_seeds(here):

@@ -136,7 +136,10 @@ def test_offline_to_online(bam_train):
         ({"data": "nowhere"}, "nowhere: no such file or folder. Check the name"),
         ({"env": "bam/reach"}, "data: points is of elsewhere/Point-v0, not of bam/reach-v0; leave --env out"),
         ({"until_success": 0.9}, "until_success: nothing is chosen by simulation while learning from data"),
-        ({"algo": "ppo"}, "Unknown algorithm 'ppo'. It is one of rllib's; those of offline are: awac, bc, cal-ql"),
+        (
+            {"algo": "ppo"},
+            "ppo learns in the environment, and not from a data set. Leave --data out, or choose from: awac, bc",
+        ),
         ({"set": ("widht=3",)}, "hyperparameters: unknown key 'widht'"),
     ],
 )

@@ -102,6 +102,12 @@ def test_the_policy_fits_what_is_observed(name, space, policy):
         ("ppo", {"lerning_rate": 1}, "Unknown ppo hyperparameter 'lerning_rate'. Did you mean 'learning_rate'?"),
         ("ppo", {"step": 1}, "Unknown ppo hyperparameter 'step'. Did you mean 'steps'?"),
         ("ppo", {"batch_size": 1.5}, "batch_size: expected a whole number, found 1.5"),
+        (
+            "ppo",
+            {"normalize": True},
+            "normalize is not a hyperparameter here: it is a setting of the run; give it beside the hyperparameters, "
+            "not among them",
+        ),
         ("ppo", {"seed": 1}, "seed is not a hyperparameter here: use --seed"),
         ("sac", {"verbose": 1}, "verbose is not a hyperparameter here: bam-train takes care of it"),
         ("dqn", {"policy": "MlpPolcy"}, "policy: unknown policy 'MlpPolcy' of dqn. Did you mean 'MlpPolicy'?"),
