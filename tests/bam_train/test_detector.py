@@ -24,24 +24,24 @@ def rollouts(number, seed, *, delay=0, gain=1.0, steps=50, share=None):
 
     With `share`, commands are sent: that share of the actions, drawn for each episode up to 1.
     """
-    rng = np.random.default_rng(seed)
-    done = []
+    rng, drawn = np.random.default_rng(seed), []
     for _ in range(number):
-        here, speed = rng.uniform(-1, 1, 2), np.zeros(2)
-        pending, pace = [np.zeros(2)] * delay, 1.0 if share is None else rng.uniform(share, 1.0)
-        seen, acted, sent = [], [], [np.zeros(2)]
-        for _ in range(steps):
-            observation = np.concatenate([here, speed]).astype(np.float32)
-            action = np.clip(-2 * observation[:2] - observation[2:] + 0.05 * rng.standard_normal(2), -1, 1)
-            sent.append(pace * action)
-            pending.append(pace * action)
-            speed = 0.8 * speed + 0.2 * gain * pending.pop(0) + 0.005 * rng.standard_normal(2)
-            here = here + 0.2 * speed
-            seen.append(observation)
-            acted.append(action.astype(np.float32))
-        commands = None if share is None else np.array(sent[:-1])
-        done.append(Rollout(np.array(seen), np.array(acted), True, commands))
-    return done
+        start = rng.uniform(-1, 1, 2)
+        drawn.append((start, 1.0 if share is None else rng.uniform(share, 1.0), rng.standard_normal((steps, 2, 2))))
+    here, pace, noise = map(np.array, zip(*drawn, strict=True))
+    speed, pace, sent = np.zeros((number, 2)), pace[:, None], [np.zeros((number, 2))]
+    pending, seen, acted = [np.zeros((number, 2))] * delay, [], []
+    for k in range(steps):
+        seen.append(np.concatenate([here, speed], axis=1).astype(np.float32))
+        action = np.clip(-2 * seen[-1][:, :2] - seen[-1][:, 2:] + 0.05 * noise[:, k, 0], -1, 1)
+        acted.append(action.astype(np.float32))
+        sent.append(pace * action)
+        pending.append(sent[-1])
+        speed = 0.8 * speed + 0.2 * gain * pending.pop(0) + 0.005 * noise[:, k, 1]
+        here = here + 0.2 * speed
+    seen, acted, sent = (np.stack(one, axis=1) for one in (seen, acted, sent[:-1]))
+    commands = sent if share is not None else [None] * number
+    return [Rollout(*one[:2], True, one[2]) for one in zip(seen, acted, commands, strict=True)]
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ A range is ``Annotated[float, msgspec.Meta(gt=0, le=2)]``; the names below are t
 refuses NaN and infinity. ``Meta(description=...)`` replaces an error's description of the type and its range.
 """
 
+import functools
 import re
 import sys
 import types
@@ -139,10 +140,11 @@ def check_keys(
             raise error(f"{where}: unknown key {key!r}. {did_you_mean(key, known, cutoff=0.5)}")
 
 
-def type_hints(kind: type[Any]) -> dict[str, Any]:
+@functools.cache
+def type_hints(kind: type[Any]) -> Mapping[str, Any]:
     """The annotation of each field of a dataclass, with its ranges."""
     hints = get_type_hints(kind, include_extras=True)
-    return {field.name: hints[field.name] for field in fields(kind)}
+    return types.MappingProxyType({field.name: hints[field.name] for field in fields(kind)})
 
 
 def expected(kind: Any) -> str:

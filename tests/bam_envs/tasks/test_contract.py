@@ -105,7 +105,8 @@ class Simulated(TaskContract):
 )
 class TestSimulated(Simulated):
     @pytest.fixture(autouse=True)
-    def chosen(self, env_id, options, randomize):
+    def chosen(self, request, env_id, options, randomize):
+        self.steps = 20 if request.node.get_closest_marker("slow") else 60
         self.id, self.options, self.randomize = env_id, options, randomize
         arm = robot_model("ur5e" if env_id in BASES else options.get("robot_model", "ur5e"))
         self.joints, self.tool_position = arm.num_joints, arm.arm.tool_position

@@ -1,6 +1,7 @@
 """The contract between a checkpoint and a robot: mutated robots are refused by the right line, correct ones are not."""
 
 import copy
+import functools
 import json
 import math
 import random
@@ -33,17 +34,19 @@ from bam_train.errors import ContractRefused
 PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
 JOINTS = np.array([-0.27, -1.54, 1.89, -1.93, -1.47, -1.84])
 WALL, BEGIN = 1.7e9, 1000.0
+profile_of = functools.cache(load_profile)
 
 
 class Watched:
     """A robot that publishes for half a second, on a clock of its own; a test changes something first."""
 
     def __init__(self, profile, spec, seed=0):
-        self.profile, self.spec = load_profile(profile), load_profile(profile).spec(spec)
+        self.profile = profile_of(profile)
+        self.spec = self.profile.spec(spec)
         self.rng, self.noise = np.random.default_rng(seed), 0.0
         self.rate, self.seconds, self.delay, self.clock, self.frozen = 100.0, 0.5, 0.001, 0.0, False
         self.ahead, self.late, self.stall, self.listening = 0.0, np.zeros(10, np.bool_), 0.0, 0.0
-        self.mangle = lambda topic, message: message
+        self.mangle = None
         self.types, self.info, self.urdf, self.task = {}, None, None, SimpleNamespace()
         self.changes = {}
 
@@ -67,7 +70,8 @@ class Watched:
             wall = at + (self.stall if 2 * at > self.seconds else 0.0)
             stamp = write_stamp(WALL + self.clock + self.ahead + (0.0 if self.frozen else wall))
             for topic, _, message in encode_state(self.profile, state, 0, stamp):
-                message = self.mangle(topic, copy.deepcopy(message))
+                if self.mangle is not None:
+                    message = self.mangle(topic, copy.deepcopy(message))
                 if topic in letters and message is not None:
                     late = self.delay + self.noise * abs(self.rng.normal(0.0, 0.002))
                     arrived = BEGIN + max(wall + late, self.listening)

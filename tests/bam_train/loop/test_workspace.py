@@ -100,7 +100,6 @@ def test_pickled_and_copied(kind, again):
 @pytest.mark.parametrize("window", [None, 3])
 def test_a_workspace_is_freed_at_once(kind, window):
     """A workspace an epoch is the usual form: they must not wait for the garbage collector."""
-    gc.collect()
     gc.disable()
     try:
         workspace = Workspace(window=window)
