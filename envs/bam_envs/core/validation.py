@@ -140,9 +140,13 @@ def check_keys(
             raise error(f"{where}: unknown key {key!r}. {did_you_mean(key, known, cutoff=0.5)}")
 
 
-@functools.cache
-def type_hints(kind: type[Any]) -> Mapping[str, Any]:
+def type_hints(kind: Any) -> Mapping[str, Any]:
     """The annotation of each field of a dataclass, with its ranges."""
+    return _type_hints(kind)
+
+
+@functools.cache
+def _type_hints(kind: Any) -> Mapping[str, Any]:
     hints = get_type_hints(kind, include_extras=True)
     return types.MappingProxyType({field.name: hints[field.name] for field in fields(kind)})
 
