@@ -11,10 +11,11 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from pkgutil import resolve_name
 
 import pytest
 
-from bam_envs.core.registry import ENVIRONMENTS, resolve
+from bam_envs.core.registry import ENVIRONMENTS
 from bam_envs.robots.base_description import CLEARANCE, base_model
 from bam_envs.robots.physics.domain_randomization import Ranges
 from bam_envs.tasks import (
@@ -227,8 +228,8 @@ def test_flags_on_the_site_are_the_flags_of_the_programs(make_docs, program, mon
     assert set(re.findall(r"--[a-z][a-z-]*", make_docs.build(part[0]))) - {"--help"} == there
 
 
-CONFIGS = [resolve("bam_train.cli.flags:TrainConfig")]
-CONFIGS += map(resolve, re.findall(r"site: flags (\S+)", "".join(page.read_text() for page in DOCS)))
+CONFIGS = [resolve_name("bam_train.cli.flags:TrainConfig")]
+CONFIGS += map(resolve_name, re.findall(r"site: flags (\S+)", "".join(page.read_text() for page in DOCS)))
 
 
 @pytest.mark.parametrize("config", CONFIGS)
@@ -238,7 +239,7 @@ def test_help_has_examples_that_are_accepted_and_every_flag_in_one_group(config)
     for line in examples:
         program, *words = shlex.split(line)
         asks = program == "bam-agent" and not words[0].startswith("-")
-        wanted = resolve("bam_train.cli.live.agent_flags:AskConfig") if asks else config
+        wanted = resolve_name("bam_train.cli.live.agent_flags:AskConfig") if asks else config
         parse(wanted, program, words[program in ("bam-data", "bam-robots") :])
     text = help_text(config, "prog", description)
     assert examples
@@ -275,7 +276,7 @@ def test_the_workflow_for_ci_has_commands_that_exist():
     lines = [line for step in steps for line in step.get("run", "").replace("\\\n", "").splitlines() if "bam-" in line]
     programs = [re.split(r"[ |]", line.strip())[0] for line in lines if line.strip().startswith("bam-")]
     assert programs == ["bam-eval", "bam-gate", "bam-sign", "bam-push"]
-    config = resolve("bam_train.cli.live.agent_flags:PushConfig")
+    config = resolve_name("bam_train.cli.live.agent_flags:PushConfig")
     given = re.findall(r"--([a-z-]+)", lines[-1])
     assert set(given) <= {name.replace("_", "-") for name in config.__dataclass_fields__}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json as json_module
 from functools import partial
 from itertools import groupby
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import tell
@@ -27,10 +28,10 @@ def show_environments(config: EnvsConfig) -> None:
 def overview() -> list[dict[str, Any]]:
     """Facts of each environment of `bam_envs`, as JSON values; imports no simulator."""
     from bam_envs.aliases import ROBO_GYM
-    from bam_envs.core.registry import ENVIRONMENTS, resolve
+    from bam_envs.core.registry import ENVIRONMENTS
     from bam_envs.core.spaces import space_text
 
-    tasks = [(entry, resolve(entry.task)(1)) for entry in ENVIRONMENTS.values()]
+    tasks = [(entry, resolve_name(entry.task)(1)) for entry in ENVIRONMENTS.values()]
     return [
         {
             "id": entry.id,

@@ -21,7 +21,7 @@ from bam_envs.core.registry import entry_of, resolve_id
 from bam_envs.core.robot_models import Description, find_model, require_same_robot
 from bam_envs.core.spaces import space_to_json
 from bam_envs.core.wording import did_you_mean
-from bam_envs.robo_gym.making import constructor_options, require_values
+from bam_envs.robo_gym.making import require_values, taken_and_refused
 from bam_envs.robots.linked import link_profile
 from bam_envs.safety.guard import TRIAL_SPEED
 from bam_envs.tasks.task_wrappers import read_delay
@@ -101,7 +101,7 @@ def require_env_kwargs(env: str, given: Mapping[str, Any]) -> None:
             f"env_kwargs.max_episode_steps: episodes of {env} have at most {entry.max_episode_steps} steps, "
             f"found {limit}; use {entry.id} for longer ones"
         )
-    taken, refused = constructor_options(theirs) if theirs else (frozenset(), frozenset())
+    taken, refused = taken_and_refused(theirs) if theirs else (frozenset(), frozenset())
     known = SIMULATED.keys() | taken | options.keys() | {"max_episode_steps"}  # the place has its own flags
     if "robot_model" in given and "robot_model" not in options:
         own = "; its arm is --set env_kwargs.ur_model=ur10" if "ur_model" in options else ""

@@ -19,12 +19,13 @@ import re
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
 
 from bam_envs.core.env_options import CAMERA_OPTIONS as IMAGES
-from bam_envs.core.registry import ENVIRONMENTS, NO_ROBOT, EnvEntry, resolve
+from bam_envs.core.registry import ENVIRONMENTS, NO_ROBOT, EnvEntry
 from bam_envs.core.robot import SignalSpec
 from bam_envs.core.spaces import space_text
 from bam_train.cli import program
@@ -118,7 +119,7 @@ def environment(env_id: str, told: dict[str, str] | None = None) -> str:
     """Everything about one environment; ``told`` has the texts of those above it on its page, and their ids."""
     told = {} if told is None else told
     entry = ENVIRONMENTS[env_id]
-    task = resolve(entry.task)
+    task = resolve_name(entry.task)
     docs = {name: text for kind in reversed(task.__mro__[:-1]) for name, text in sections(kind.__doc__ or "").items()}
     limit, robot = entry.time_limit, entry.has_robot
     time = "There is no robot." if entry.robot == NO_ROBOT else f"One step is {entry.period:g} s of robot time."
@@ -156,7 +157,7 @@ def _new(told: dict[str, str], text: str, env_id: str) -> str:
 
 def parity(env_id: str) -> str:
     """What ``parity=True`` changes."""
-    variants = map(resolve, ENVIRONMENTS[env_id].variants.values())
+    variants = map(resolve_name, ENVIRONMENTS[env_id].variants.values())
     texts = [text for variant in variants for text in _paragraphs(variant, "With ``parity=True``")]
     return f"**Parity.** {' '.join(texts)}" if texts else ""
 
@@ -187,7 +188,7 @@ def _paragraphs(kind: type, beginning: str) -> list[str]:
 def arguments(entry: EnvEntry) -> list[tuple[str, str, str]]:
     """Name, default and meaning of an environment's options, out of the docstrings of its task's classes."""
     meanings = {"parity": "robo-gym's arithmetic: see above."}
-    for kind in resolve(entry.task).__mro__:
+    for kind in resolve_name(entry.task).__mro__:
         body = re.search(r"^Args:\n((?:[ ]{4}.*\n?|\n)+)", inspect.cleandoc(kind.__doc__ or ""), re.MULTILINE)
         text = textwrap.dedent(body[1]) if body else ""
         meanings = dict(re.findall(r"^(\w+): ((?:.*\n?)(?:^ +.*\n?)*)", text, re.MULTILINE)) | meanings
@@ -244,7 +245,7 @@ def _once(rows: list[list[str]]) -> list[list[str]]:
 
 def robot_signals() -> str:
     """What the arm measures and what it is sent."""
-    spec = resolve(ENVIRONMENTS["bam/pick-v0"].robot)(1).spec
+    spec = resolve_name(ENVIRONMENTS["bam/pick-v0"].robot)(1).spec
     header = ["signal", "names", "unit", "min", "max"]
     measured = table(header, [row[:-1] for signal in spec.signals for row in _signal_rows(signal)])
     sent = table([*header, "fastest change"], _signal_rows(spec.command))
@@ -266,7 +267,7 @@ def _signal_rows(signal: SignalSpec) -> list[list[object]]:
 
 def fields_of(reference: str) -> str:
     """Name, type and meaning of every field of the dataclass ``"module:Class"``."""
-    kind = resolve(reference)
+    kind = resolve_name(reference)
     docs = field_docs(kind)
     fields = dataclasses.fields(kind)
     return "\n".join(f"- `{field.name}: {_plain(str(field.type))}`: {docs[field.name]}" for field in fields)
@@ -280,7 +281,7 @@ def _plain(kind: str) -> str:
 
 def defaults_of(reference: str) -> str:
     """Name, default and meaning of every field of the dataclass ``"module:Class"``."""
-    kind = resolve(reference)
+    kind = resolve_name(reference)
     docs = field_docs(kind)
     return "\n".join(item(field.name, default_of(field), docs[field.name]) for field in dataclasses.fields(kind))
 
@@ -302,7 +303,7 @@ def default_of(field: dataclasses.Field[Any]) -> str:
 
 def flags_of(reference: str) -> str:
     """The ``--help`` of a program whose configuration is the dataclass ``"module:Class"``."""
-    kind = resolve(reference)
+    kind = resolve_name(reference)
     text = program.help_text(kind, "", inspect.cleandoc(kind.__doc__ or ""))
     return printed(text.partition("\n\n")[2])  # without the line of its usage
 

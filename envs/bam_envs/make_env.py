@@ -6,13 +6,14 @@ Live robots, remote environments and Gymnasium's vector environments are importe
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
 from bam_envs.core.errors import InvalidValue, UnknownName
 from bam_envs.core.location import Credentials, LiveRobot, Location, Remote, location_of
-from bam_envs.core.registry import ENVIRONMENTS, MAKE_OPTIONS, EnvEntry, entry_of, own_options, resolve
+from bam_envs.core.registry import ENVIRONMENTS, MAKE_OPTIONS, EnvEntry, entry_of, own_options
 from bam_envs.core.validation import PositiveInt, check
 
 if TYPE_CHECKING:
@@ -86,11 +87,11 @@ def make_env(
     if not isinstance(place, LiveRobot):
         return RobotEnv(_behind(link, simulation), _late(action_delay, task), render_mode=render_mode)
     if place.stage == "shadow":
-        return RobotEnv(resolve("bam_envs.live:shadow_robot")(place, simulation.spec), task)
+        return RobotEnv(resolve_name("bam_envs.live:shadow_robot")(place, simulation.spec), task)
     tool = getattr(simulation, "tool_position", None)  # forward kinematics of an arm that is no UR5e
     straight = getattr(task, "moves_straight", False)
     return RobotEnv(
-        resolve("bam_envs.live:live_robot")(place, simulation.spec, tool_position=tool, straight=straight), task
+        resolve_name("bam_envs.live:live_robot")(place, simulation.spec, tool_position=tool, straight=straight), task
     )
 
 

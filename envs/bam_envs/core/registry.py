@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -70,7 +71,7 @@ class EnvEntry:
     def options(self) -> dict[str, Any]:
         """The options of the task, flags of variants and cameras among them, with their defaults."""
         images = {**CAMERA_OPTIONS, "camera": list(self.shows) or None} if self.cameras else {}
-        return constructor_options(resolve(self.task)) | images | dict.fromkeys(self.variants, False)
+        return constructor_options(resolve_name(self.task)) | images | dict.fromkeys(self.variants, False)
 
     def read_cameras(self, given: Mapping[str, Any]) -> tuple[CameraSpec, ...]:
         """The cameras that these options ask for; raises the errors of `bam_envs.core.env_options.read_cameras`."""
@@ -88,13 +89,13 @@ class EnvEntry:
         require_known(self.id, options, given, MAKE_OPTIONS)
         require_kinds(self.id, options, given)
         flags = [flag for flag in self.variants if given.get(flag)]
-        kind = resolve(self.variants[flags[0]] if flags else self.task)
+        kind = resolve_name(self.variants[flags[0]] if flags else self.task)
         images = CAMERA_OPTIONS if self.cameras else {}
         own = {name: value for name, value in given.items() if name not in self.variants and name not in images}
         task: Task = kind(num_envs, **own)
         cameras = self.read_cameras(given)
         if cameras:
-            task = resolve("bam_envs.tasks.task_wrappers:CameraTask")(task, cameras)
+            task = resolve_name("bam_envs.tasks.task_wrappers:CameraTask")(task, cameras)
         return task
 
     def make_robot(self, num_robots: int, randomize: bool, task_options: Mapping[str, Any]) -> Robot:
@@ -108,7 +109,7 @@ class EnvEntry:
         cameras = self.read_cameras(task_options)
         if cameras:
             shared |= {"cameras": cameras, "looks": task_options.get("looks", CAMERA_OPTIONS["looks"])}
-        robot: Robot = resolve(self.robot)(num_robots, randomize=randomize, **shared)
+        robot: Robot = resolve_name(self.robot)(num_robots, randomize=randomize, **shared)
         return robot
 
 
@@ -347,9 +348,3 @@ def _import_for(module: str, name: str) -> None:
             f"Environment {name!r} needs the module {module!r}, which is neither installed nor in this folder. "
             "Install it, or run in the folder that has it."
         ) from error
-
-
-def resolve(reference: str) -> Any:
-    """The object that ``"module:name"`` names."""
-    module, _, name = reference.partition(":")
-    return getattr(importlib.import_module(module), name)

@@ -179,7 +179,7 @@ class RobotEnv(_RobotAndTask, gym.Env[Any, Any]):
             self._observed = observation
         if self.render_mode == "human":
             self.render()
-        return observation, float(score.reward[0]), terminated, False, plain_info(score)
+        return observation, float(score.reward[0]), terminated, False, first_info(score)
 
     def state_dict(self) -> dict[str, Any]:
         """The complete state of a simulated robot, its task and its generator; plain arrays and values."""
@@ -224,7 +224,7 @@ def checked_action(space: gym.Space[Any], action: Any) -> NDArray[Any]:
     return array
 
 
-def plain_info(score: Score) -> dict[str, Any]:
+def first_info(score: Score) -> dict[str, Any]:
     """The info of the first environment in plain Python values, without empty texts."""
     info = {key: _plain(value[0]) for key, value in score.info.items() if _present(value)[0]}
     return {"is_success": bool(score.success[0]), **info}

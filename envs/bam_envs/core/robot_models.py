@@ -15,13 +15,13 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from importlib import metadata, resources
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar, TypeVar, get_origin
 
 from msgspec import Meta
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, UnknownName
 from bam_envs.core.location import config_folder
-from bam_envs.core.registry import resolve
 from bam_envs.core.validation import DATA_SHEET, NonEmpty, Positive, check, read_table, type_hints
 
 tomllib: Any = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
@@ -114,7 +114,7 @@ def description_of(table: Mapping[str, Any], where: str, *, saved: bool = False)
 
     One that was `saved` with a policy may have limits that are greater than any robot's: such were once described.
     """
-    kind: type[Description] = resolve(_BASE if {"drive", "footprint", "lasers"} & table.keys() else _ARM)
+    kind: type[Description] = resolve_name(_BASE if {"drive", "footprint", "lasers"} & table.keys() else _ARM)
     read, hints = dict(table), type_hints(kind)
     for key, part in kind.PARTS.items():
         if key not in read:

@@ -1,6 +1,6 @@
 """Environments that run in another process: transports to them, Gymnasium environments over these, and servers."""
 
-import importlib
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def __getattr__(name: str) -> Any:
     module = next((module for module, names in _MODULES.items() if name in names), None)
     if module is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+    return resolve_name(f"{__name__}.{module}:{name}")
 
 
 def __dir__() -> list[str]:

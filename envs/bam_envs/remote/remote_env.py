@@ -1,8 +1,8 @@
 """RemoteEnv: an environment that runs elsewhere, as a `gymnasium.Env`; and functions that make one from a URL."""
 
-import importlib
 import inspect
 from collections.abc import Mapping, Sequence
+from pkgutil import resolve_name
 from typing import Any
 
 import gymnasium as gym
@@ -191,8 +191,7 @@ def open_transport(
         meant = f" Did you mean {f'{close}://{rest}'!r}?" if close else ""
         raise InvalidValue(f"{url}: unknown transport {scheme}://; there are {schemes}.{meant}")
     options |= {"credentials": credentials} | ({} if timeout is None else {"timeout": timeout})
-    module, _, name = _CLASSES[scheme].partition(":")
-    make: Any = getattr(importlib.import_module(module), name)
+    make: Any = resolve_name(_CLASSES[scheme])
     # A class that passes options on to its parent takes the parent's options too.
     signatures = [inspect.signature(kind) for kind in make.__mro__ if "__init__" in vars(kind) and kind is not object]
     known = dict.fromkeys(name for signature in signatures for name in signature.parameters)

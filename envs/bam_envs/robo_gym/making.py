@@ -114,7 +114,7 @@ def translate(entry: RoboGymId, given: Mapping[str, Any]) -> dict[str, Any]:
         InvalidValue: An option of robo-gym that is not supported, or of the wrong kind; a live robot without an
             address, or a simulated one with an address.
     """
-    taken, refused = constructor_options(entry)
+    taken, refused = taken_and_refused(entry)
     known = {*_task_options(entry), *MAKE_OPTIONS, "max_episode_steps", *taken}
     for name in given:
         if name in refused and name in _NOT_HERE:
@@ -174,7 +174,7 @@ def _robot(entry: RoboGymId, given: Mapping[str, Any]) -> Any:
     return f"ws://{text}"
 
 
-def constructor_options(entry: RoboGymId) -> tuple[frozenset[str], frozenset[str]]:
+def taken_and_refused(entry: RoboGymId) -> tuple[frozenset[str], frozenset[str]]:
     """Options of robo-gym's constructors that the tasks lack: those accepted, and those refused with a reason."""
     taken = frozenset({*_SIMULATED, "rs_address"} if entry.is_live else _SIMULATED)
     return taken, frozenset({"rs_address", *_NOT_HERE}) - taken - _task_options(entry).keys()

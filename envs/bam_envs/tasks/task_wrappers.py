@@ -25,8 +25,6 @@ _Steps = Annotated[int, Meta(ge=0, le=32, description="a whole number from 0 to 
 class _Wrapper:
     """A task around `task`, which has all its other attributes."""
 
-    task: Any
-
     def __getattr__(self, name: str) -> Any:
         """Any other attribute is that of the task."""
         if name == "task" or name.startswith("__"):

@@ -1,13 +1,14 @@
 """The one table of environments."""
 
 import inspect
+from pkgutil import resolve_name
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.core.registry import ENVIRONMENTS, MAKE_OPTIONS, register, resolve, resolve_id
+from bam_envs.core.registry import ENVIRONMENTS, MAKE_OPTIONS, register, resolve_id
 from bam_envs.core.robot_env import RobotEnv, RobotVectorEnv
 from bam_envs.make_env import make_env, make_vector_env
 
@@ -45,7 +46,7 @@ def test_the_table():
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_every_row_makes_what_it_says(env_id):
     entry = ENVIRONMENTS[env_id]
-    robot, task = resolve(entry.robot)(2), resolve(entry.task)(2)
+    robot, task = resolve_name(entry.robot)(2), resolve_name(entry.task)(2)
     assert robot.num_robots == task.num_envs == 2
     assert robot.spec.period == entry.period
 

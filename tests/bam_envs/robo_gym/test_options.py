@@ -8,7 +8,7 @@ import pytest
 
 from bam_envs.aliases import ROBO_GYM
 from bam_envs.core.errors import InvalidValue, UnknownName
-from bam_envs.robo_gym.making import constructor_options, say_once, translate
+from bam_envs.robo_gym.making import say_once, taken_and_refused, translate
 
 SIM, ROB = ROBO_GYM["EndEffectorPositioningURSim-v0"], ROBO_GYM["EndEffectorPositioningURRob-v0"]
 DEFAULTS = {"ur_model": "ur5", "rs_state_to_info": True}
@@ -191,7 +191,7 @@ def test_a_live_robot_takes_what_a_simulated_one_does(told):
 @pytest.mark.parametrize("entry", [SIM, ROB])
 def test_what_robo_gym_takes_and_we_do_not(entry):
     assert translate(entry, {"robot": "ws://a:1", "parity": np.True_})["parity"]
-    taken, refused = constructor_options(entry)
+    taken, refused = taken_and_refused(entry)
     assert {"ip", "gui"} <= taken
     assert "rs_address" in (taken if entry.is_live else refused)
     assert "action_rate" in refused
