@@ -66,7 +66,7 @@ def load(filename: str | Path) -> Any:
     """Load an agent of `SerializableAgent.save`, from a pickle, which can run any code: load only files you trust."""
     try:
         return pickle.loads(Path(filename).expanduser().read_bytes())
-    except (OSError, pickle.UnpicklingError, EOFError) as error:
+    except (OSError, pickle.UnpicklingError, EOFError, AttributeError, ImportError) as error:
         raise LoopError(f"{filename}: no agent can be loaded: {error}") from error
 
 

@@ -8,10 +8,10 @@ import ipaddress
 import os
 import shlex
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NoReturn
+from typing import Any, ClassVar, Literal
 from urllib.parse import urlsplit
 
 from bam_envs.core.errors import InvalidValue
@@ -154,46 +154,11 @@ def location_of(
     Raises:
         error: Options exclude each other, or have no effect at the location.
     """
-
-    def refuse(text: str) -> NoReturn:
-        raise error(f"{text}." if error is InvalidValue else text)
-
     given = {name: value for name, value in options.items() if _is_given(name, value)}
     robot, urls, timeout = given.get("robot"), addresses(given.get("transport")), given.get("timeout")
-    at, to, is_here = shown("robot"), shown("transport"), robot is None and not urls
-    if robot is not None and urls:
-        refuse(f"{at} and {to} exclude each other: the task runs here, or over there; give one")
-    if "transport" in given and not urls:
-        refuse(f"{to}: expected an address, found none; leave it out for the simulation here")
-    files = [name for name, value in vars(credentials).items() if value is not None]
-    for name in (one for one in (*given, *files) if isinstance(robot, LiveRobot) and one in (*_LIVE, *files)):
-        refuse(f"{shown(name)} is a field of the LiveRobot that {at} is; give it there")
-    for name in (one for one in _LIVE if one in given and robot is None):
-        refuse(f"{shown(name)} {_LIVE[name]}; give its address with {at} too")
-    for name in (one for one in ("fast", "rate") if one in given and robot is not None):
-        refuse(f"a live robot is driven at the rate that its policy was made for; leave out {shown(name)}")
-    if "i_know" in given and given.get("stage") != "full":
-        refuse(f"{shown('i_know')} is for {shown('stage')} full alone; leave it out")
-    if "shadow" in given:
-        if moving := [shown(name) for name in _MOVING if name in given]:
-            refuse(f"{shown('shadow')} moves nothing; leave out {' and '.join(moving)}")
-        if "unusual" in given:
-            flag = shown("unusual")
-            refuse(f"{shown('shadow')} sends nothing, and {flag} is about what is sent; leave {flag} out")
-    simulated = ", ".join(name for name in ("render_mode", *SIMULATED) if name in given)
-    if simulated and not is_here:
-        where = ", ".join(urls) or getattr(robot, "text", robot)
-        refuse(f"{simulated}: only the simulation here has that, and not {where}; leave it out")
-    if files and is_here:
-        links = f"{at} or {to}" if "transport" in options else at
-        refuse(f"{shown(files[0])} is for a link, and the robot is simulated here; give {links}")
-    for url in (one for one, number in Counter(url.rstrip("/") for url in urls).items() if number > 1):
-        refuse(f"{to}: {url} comes twice, and an address is one environment; give it once")
-    plain = [url for url in (robot, *urls) if isinstance(url, str) and not url.startswith("wss://")]
-    if credentials.ca_file is not None and plain:
-        refuse(f"{shown('ca_file')} is for wss:// only, and {plain[0]} is without TLS; leave it out")
-    if timeout is not None and not urls:
-        refuse(f"{shown('timeout')} limits the wait for an answer of {to}; leave it out")
+    conflict = next(_conflicts(options, given, credentials, shown), None)
+    if conflict is not None:
+        raise error(f"{conflict}." if error is InvalidValue else conflict)
     check(timeout, Positive | None, shown("timeout").rstrip("="), error)
     check(robot_name := given.get("robot_name", ""), RobotName, shown("robot_name").rstrip("="), error)
     if urls:
@@ -203,6 +168,47 @@ def location_of(
     guards = given.get("guard", given.get("guards", {}))
     stage: Any = "shadow" if "shadow" in given else "trial" if "trial" in given else given.get("stage")
     return LiveRobot(robot, credentials, given.get("profile"), guards, stage, robot_name)
+
+
+def _conflicts(
+    options: Mapping[str, Any], given: Mapping[str, Any], credentials: Credentials, shown: Callable[[str], str]
+) -> Iterator[str]:
+    """Why the `options` that are `given` exclude each other, or have no effect."""
+    robot, urls = given.get("robot"), addresses(given.get("transport"))
+    at, to, is_here = shown("robot"), shown("transport"), robot is None and not urls
+    if robot is not None and urls:
+        yield f"{at} and {to} exclude each other: the task runs here, or over there; give one"
+    if "transport" in given and not urls:
+        yield f"{to}: expected an address, found none; leave it out for the simulation here"
+    files = [name for name, value in vars(credentials).items() if value is not None]
+    for name in (one for one in (*given, *files) if isinstance(robot, LiveRobot) and one in (*_LIVE, *files)):
+        yield f"{shown(name)} is a field of the LiveRobot that {at} is; give it there"
+    for name in (one for one in _LIVE if one in given and robot is None):
+        yield f"{shown(name)} {_LIVE[name]}; give its address with {at} too"
+    for name in (one for one in ("fast", "rate") if one in given and robot is not None):
+        yield f"a live robot is driven at the rate that its policy was made for; leave out {shown(name)}"
+    if "i_know" in given and given.get("stage") != "full":
+        yield f"{shown('i_know')} is for {shown('stage')} full alone; leave it out"
+    if "shadow" in given:
+        if moving := [shown(name) for name in _MOVING if name in given]:
+            yield f"{shown('shadow')} moves nothing; leave out {' and '.join(moving)}"
+        if "unusual" in given:
+            flag = shown("unusual")
+            yield f"{shown('shadow')} sends nothing, and {flag} is about what is sent; leave {flag} out"
+    simulated = ", ".join(name for name in ("render_mode", *SIMULATED) if name in given)
+    if simulated and not is_here:
+        where = ", ".join(urls) or getattr(robot, "text", robot)
+        yield f"{simulated}: only the simulation here has that, and not {where}; leave it out"
+    if files and is_here:
+        links = f"{at} or {to}" if "transport" in options else at
+        yield f"{shown(files[0])} is for a link, and the robot is simulated here; give {links}"
+    for url in (one for one, number in Counter(url.rstrip("/") for url in urls).items() if number > 1):
+        yield f"{to}: {url} comes twice, and an address is one environment; give it once"
+    plain = [url for url in (robot, *urls) if isinstance(url, str) and not url.startswith("wss://")]
+    if credentials.ca_file is not None and plain:
+        yield f"{shown('ca_file')} is for wss:// only, and {plain[0]} is without TLS; leave it out"
+    if "timeout" in given and not urls:
+        yield f"{shown('timeout')} limits the wait for an answer of {to}; leave it out"
 
 
 def _is_given(name: str, value: object) -> bool:

@@ -24,7 +24,7 @@ from bam_envs.core.errors import InvalidValue, ResetNeeded, UnknownName
 from bam_envs.core.location import LiveRobot
 from bam_envs.core.robot import EnvIds, Robot, RobotState
 from bam_envs.core.spaces import indexed
-from bam_envs.core.task import Label, Score, Task
+from bam_envs.core.task import Label, Task, first_info, present
 from bam_envs.core.wording import brief
 
 RENDER_MODES = ["rgb_array", "human"]
@@ -224,30 +224,6 @@ def checked_action(space: gym.Space[Any], action: Any) -> NDArray[Any]:
     return array
 
 
-def first_info(score: Score) -> dict[str, Any]:
-    """The info of the first environment in plain Python values, without empty texts."""
-    info = {key: _plain(value[0]) for key, value in score.info.items() if _present(value)[0]}
-    return {"is_success": bool(score.success[0]), **info}
-
-
-def _present(value: NDArray[Any]) -> NDArray[np.bool_]:
-    """Mask of the environments that have this info; an empty text means none. Shape: (n,)."""
-    if value.dtype.kind in "US":
-        return np.asarray(value != "")
-    if value.dtype.kind == "O":
-        return np.array([not (isinstance(one, str) and one == "") for one in value], dtype=bool)
-    return np.ones(len(value), dtype=bool)
-
-
-def _plain(value: Any) -> Any:
-    """Text as str, one number as float, several as a new array, objects unchanged."""
-    if isinstance(value, str):
-        return str(value)
-    if isinstance(value, np.ndarray):
-        return value.tolist() if value.dtype.kind in "US" else value.copy()
-    return float(value) if isinstance(value, np.generic) else value
-
-
 class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
     """n simulated robots stepped together; environment i equals a `RobotEnv` with the same seed, bit for bit.
 
@@ -322,7 +298,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[Any, Any, NDArray[Any]]
         truncated = np.zeros(self.num_envs, dtype=bool) if limit is None else self.elapsed >= limit
         infos = {"is_success": score.success, "_is_success": self._all.copy()}
         for key, value in score.info.items():
-            infos[key], infos["_" + key] = value, _present(value)
+            infos[key], infos["_" + key] = value, present(value)
         ended = score.terminated | truncated
         if ended.any():
             observation = self._next_episodes(ended, observation, infos)

@@ -43,6 +43,11 @@ class Score:
     """Named infos, such as distances: numbers, text ("" for none) or objects. Shape: (n, ...) each."""
 
 
+def unscored(num_envs: int) -> Score:
+    """The outcome of a step that nothing rewards and that ends nothing."""
+    return Score(np.zeros(num_envs), np.zeros(num_envs, dtype=bool), np.zeros(num_envs, dtype=bool))
+
+
 @runtime_checkable
 class Task(Protocol):
     """Observation, command, reward and end of `num_envs` environments: one live robot, or many simulated ones.
@@ -140,3 +145,27 @@ def as_objects(values: Sequence[Any]) -> NDArray[Any]:
     objects = np.empty(len(values), dtype=object)
     objects[:] = values
     return objects
+
+
+def first_info(score: Score) -> dict[str, Any]:
+    """The info of the first environment in plain Python values, without empty texts."""
+    info = {key: _plain(value[0]) for key, value in score.info.items() if present(value)[0]}
+    return {"is_success": bool(score.success[0]), **info}
+
+
+def present(value: NDArray[Any]) -> NDArray[np.bool_]:
+    """Mask of the environments that have this info; an empty text means none. Shape: (n,)."""
+    if value.dtype.kind in "US":
+        return np.asarray(value != "")
+    if value.dtype.kind == "O":
+        return np.array([not (isinstance(one, str) and one == "") for one in value], dtype=bool)
+    return np.ones(len(value), dtype=bool)
+
+
+def _plain(value: Any) -> Any:
+    """Text as str, one number as float, several as a new array, objects unchanged."""
+    if isinstance(value, str):
+        return str(value)
+    if isinstance(value, np.ndarray):
+        return value.tolist() if value.dtype.kind in "US" else value.copy()
+    return float(value) if isinstance(value, np.generic) else value

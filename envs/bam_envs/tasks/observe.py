@@ -8,7 +8,7 @@ from gymnasium import spaces
 from bam_envs.arms.description import robot_model
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.robot_models import DEFAULT_ARM
-from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
+from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited, unscored
 from bam_envs.tasks.pick import CubeTable
 from bam_envs.tasks.reach import START_NOISE
 
@@ -78,8 +78,7 @@ class ObserveTask(Memory):
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Nothing is rewarded."""
-        never = np.zeros(self.num_envs, dtype=bool)
-        return Score(np.zeros(self.num_envs), never, never.copy())
+        return unscored(self.num_envs)
 
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
         """None beyond the scene."""

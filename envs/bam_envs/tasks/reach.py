@@ -14,7 +14,7 @@ from bam_envs.arms.description import ArmDescription
 from bam_envs.arms.description import robot_model as model_called
 from bam_envs.core.robot import EnvIds, Initial, RobotState
 from bam_envs.core.robot_models import DEFAULT_ARM
-from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited
+from bam_envs.core.task import Array, Floats, Label, Memory, Score, draw_seeds, labelled_box, limited, unscored
 from bam_envs.core.validation import check
 from bam_envs.tasks.tool_control import FASTEST, JOINT_STEP, PACE, PERIOD, JointPace, WorkSpace
 
@@ -250,8 +250,7 @@ class JointsTask(ReachTask):
 
     def score(self, state: RobotState, action: Floats) -> Score:
         """Nothing is rewarded."""
-        never = np.zeros(self.num_envs, dtype=bool)
-        return Score(np.zeros(self.num_envs), never, never.copy())
+        return unscored(self.num_envs)
 
     def marks(self) -> list[tuple[Array, tuple[float, float, float, float]]]:
         """None beyond the scene."""

@@ -109,9 +109,10 @@ def test_files_that_are_not_there_or_no_pickles(tmp_path):
     with pytest.raises(LoopError) as missing:
         load(tmp_path / "none.pickle")
     assert str(missing.value).startswith(f"{tmp_path}/none.pickle: no agent can be loaded: ")
-    (tmp_path / "text.pickle").write_text("hello")
-    with pytest.raises(LoopError):
-        load(tmp_path / "text.pickle")
+    for content in ("hello", "cgone\nActor\n.", "cmath\nActor\n."):  # a class that is not here, or no longer there
+        (tmp_path / "text.pickle").write_text(content)
+        with pytest.raises(LoopError, match=r"text\.pickle: no agent can be loaded: "):
+            load(tmp_path / "text.pickle")
     with pytest.raises(OutputError) as folder:
         Actor(1).save(tmp_path / "nowhere" / "actor.pickle")
     assert str(folder.value) == f"{tmp_path}/nowhere/actor.pickle: cannot be written: No such file or directory"
