@@ -95,8 +95,6 @@ class LateActions(_Wrapper):
         delay: Minimum and maximum delay [steps].
     """
 
-    task: Task
-
     def __init__(self, task: Task, delay: tuple[int, int]) -> None:
         self.task, (self._least, self._most) = task, delay
         self._env_ids = np.arange(task.num_envs)
