@@ -11,10 +11,12 @@ exception leaves the loop; `load_model` works.
 from __future__ import annotations
 
 import copy
+import pickle
 import sys
 from collections.abc import Iterable
 from contextlib import ExitStack
 from functools import cache
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from bam_train.errors import LoopError
@@ -196,12 +198,26 @@ class Agent(_Base):  # type: ignore[misc]
 
     def load_model(self, filename: Any) -> Any:
         """Load an agent of `save_model`, from a pickle, which can run any code: load only files that you trust."""
-        return import_torch("Agent.load_model()").load(filename, weights_only=False)
+        torch = import_torch("Agent.load_model()")
+        reader = SimpleNamespace(Unpickler=Unpickler, load=pickle.load, __name__="pickle")
+        return torch.load(filename, weights_only=False, pickle_module=reader)
 
     def _workspace(self) -> Any:
         if self.workspace is None:
             raise LoopError(f"{agent_name(self)} has no workspace outside a call; call it: agent(workspace, t=0).")
         return self.workspace
+
+
+class Unpickler(pickle.Unpickler):
+    """Finds the names of `bam_train.loop` in whichever of its modules they were when an agent was saved."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """The object `name` of `module`."""
+        if module.startswith(f"{__package__}."):
+            for place in (sys.modules[__package__], sys.modules[__name__]):
+                if name in dir(place):
+                    return getattr(place, name)
+        return super().find_class(module, name)
 
 
 def import_torch(purpose: str) -> Any:

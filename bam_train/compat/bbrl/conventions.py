@@ -5,13 +5,14 @@ with attributes such as OmegaConf's, and is never changed.
 """
 
 import importlib
+import io
 import pickle
 from pathlib import Path
 from typing import Any
 
 from bam_envs.core.wording import brief, did_you_mean
 from bam_train.errors import LoopError, OutputError, SettingsError
-from bam_train.loop.agent import Agent
+from bam_train.loop.agent import Agent, Unpickler
 from bam_train.loop.agents import SeedableAgent
 
 
@@ -65,7 +66,7 @@ class SerializableAgent(Agent):
 def load(filename: str | Path) -> Any:
     """Load an agent of `SerializableAgent.save`, from a pickle, which can run any code: load only files you trust."""
     try:
-        return pickle.loads(Path(filename).expanduser().read_bytes())
+        return Unpickler(io.BytesIO(Path(filename).expanduser().read_bytes())).load()
     except (OSError, pickle.UnpicklingError, EOFError, AttributeError, ImportError) as error:
         raise LoopError(f"{filename}: no agent can be loaded: {error}") from error
 

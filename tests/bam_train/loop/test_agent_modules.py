@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from bam_train.loop import Agent, Agents, CopyTAgent, TemporalAgent, Workspace
+from bam_train.loop import Agent, Agents, CopyTAgent, TemporalAgent, Workspace, load, temporal_agent
 
 
 class Policy(Agent):
@@ -124,7 +124,7 @@ def test_clone_clears_the_gradients_of_the_original():
     assert [p.grad for p in agent.parameters()] == [None, None]
 
 
-def test_files(tmp_path):
+def test_files(tmp_path, monkeypatch):
     agent = loop()
     agent.save_model(tmp_path / "agent.pt")
     by_torch = torch.load(tmp_path / "agent.pt", weights_only=False)
@@ -133,6 +133,15 @@ def test_files(tmp_path):
         ws = Workspace()
         other(ws, n_steps=2)
         assert ws["action"].flatten().tolist() == [1.0, 2.0]
+    with monkeypatch.context() as patch:  # as modules were called when the file was made
+        patch.setitem(sys.modules, "bam_train.loop.agents.temporal", temporal_agent)
+        patch.setattr(TemporalAgent, "__module__", "bam_train.loop.agents.temporal")
+        agent.save_model(tmp_path / "old.pt")
+        pickled = pickle.dumps(agent)
+    (tmp_path / "old.pickle").write_bytes(pickled)
+    assert b"bam_train.loop.agents.temporal" in pickled
+    assert isinstance(Agent().load_model(tmp_path / "old.pt"), TemporalAgent)
+    assert isinstance(load(tmp_path / "old.pickle"), TemporalAgent)
     torch.save(agent.state_dict(), tmp_path / "weights.pt")
     agent.load_state_dict(torch.load(tmp_path / "weights.pt"))
 
