@@ -1,10 +1,18 @@
 """Lines that programs print: without characters that a terminal executes, and with the time in a log."""
 
 import logging
+import os
+import queue
+import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 from bam_train.files.place import with_addresses
+
+_STDERR = 2
+_MOST_LINES, _LAST_LINES = 1000, 1.0
+"""Lines that wait for a terminal that is stopped, the oldest; and how long the last ones wait at the end [s]."""
 
 
 def shown(text: str) -> str:
@@ -33,14 +41,46 @@ class ShownFormatter(logging.Formatter):
         return "\n".join(map(shown, super().formatException(ei).split("\n")))
 
 
+class _BesideHandler(logging.Handler):
+    """Another thread writes the lines: nobody else waits for a terminal that is stopped, or for a full pipe."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._left_out = 0
+        self._thread = threading.Thread(target=self._write, name="bam-log", daemon=True)
+        self._thread.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if self._lines.qsize() >= _MOST_LINES:
+            self._left_out += 1
+            return
+        more, self._left_out = self._left_out, 0
+        self._lines.put(f"{self.format(record)}{f' ({more} lines before it were left out)' if more else ''}\n")
+
+    def close(self) -> None:
+        self._lines.put(None)
+        self._thread.join(_LAST_LINES)
+        super().close()
+
+    def _write(self) -> None:
+        while (line := self._lines.get()) is not None:
+            data = line.encode(errors="backslashreplace")
+            with suppress(OSError):  # nobody reads it any more
+                while data:
+                    data = data[os.write(_STDERR, data) :]
+
+
 def begin_log(who: str, level: int = logging.WARNING) -> Callable[[str], None]:
     """Log to standard error from now on: local time, name of the program, message; returns what adds a line.
+
+    No thread waits for whoever reads it; see `_BesideHandler`.
 
     Args:
         who: The program.
         level: Least level of the records of other modules.
     """
-    handler = logging.StreamHandler()
+    handler = _BesideHandler()
     handler.setFormatter(ShownFormatter(f"%(asctime)s {who}: %(message)s", "%Y-%m-%d %H:%M:%S"))
     logging.basicConfig(level=level, handlers=[handler])
     log = logging.getLogger(who)

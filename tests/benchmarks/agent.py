@@ -1,27 +1,34 @@
-"""The live agent: take-over, a push, late ticks while it swaps policies, and memory.
+"""The live agent: take-over, a stop, a push, late ticks while it swaps policies, and memory.
 
 Late ticks are counted at 100 Hz against the embedded server in another process, in turns with the same loop left alone.
 Everything else runs against a real agent with its simulated robot, on this computer.
 """
 
+import contextlib
 import subprocess
 import tempfile
 import threading
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 
 from tests.benchmarks import harness
-from tests.benchmarks.console import resume, running_agent, served_robot
+from tests.benchmarks.console import halt_after, halting_cell, resume, running_agent, served_robot, until
 from tests.benchmarks.deploy import guarded_robot
 from tests.benchmarks.harness import Peer, Row, at_most, percentiles, program, resident
 from tests.benchmarks.link import serve_robot
 
 PERIOD, SWAP_EVERY = 0.01, 0.1
 """Of a tick, and from swap to swap [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flags(harness.Flags):
+    chunks: Path | None = None
+    """A checkpoint with chunks, such as an ACT that bam-export took, for the rows of stops."""
 
 
 def trained(folder):
@@ -228,6 +235,34 @@ def measure_takeover(flags):
     yield at_most("longest step of a joint, of a period's", max(jumps), 1)
     yield at_most("a silent driver's last command to rest, at worst", max(rests), 200, "ms")
     yield f"  p50 {np.median(rests):.0f} ms; the policy was not running {stops} times in between"
+
+
+def measure_stop(flags):
+    """From a stop to the halt at the robot, while a policy of ours drives, and one with chunks, in turns.
+
+    Each has an agent and a robot of its own, and both drive until they are stopped.
+    """
+    from bam_train.checkpoint import Checkpoint
+
+    if flags.chunks is None:
+        yield "stop: --chunks act.zip measures a policy with chunks beside one of ours"
+        return
+    agents, times = {}, {"ours": [], "chunks": []}
+    with contextlib.ExitStack() as stack:
+        for name, path in zip(times, (harness.PICK, flags.chunks), strict=True):
+            manifest, folder = Checkpoint.open(path).manifest, stack.enter_context(tempfile.TemporaryDirectory())
+            url, halts = stack.enter_context(halting_cell(0, 1.0, manifest.env, manifest.env_kwargs))
+            agents[name] = stack.enter_context(running_agent(Path(folder), "--robot", url, policy=path)), halts
+        for number in range(flags.times(100)):
+            for name, (agent, halts) in agents.items():
+                resume(agent)
+                time.sleep(0.2 + 0.01 * (number % 7))
+                begun, halt = halt_after(halts, lambda agent=agent: (time.time(), agent.ask("stop"))[0])
+                times[name].append(halt - begun)
+                until(lambda agent=agent: agent.ask("status")["state"] == "paused", "no pause came")
+    for name, row in times.items():
+        yield percentiles(f"stop to halt, {name}", row, "ms")
+    yield at_most("stop with chunks, of ours", np.median(times["chunks"]) / np.median(times["ours"]), 1.3)
 
 
 def measure_push(flags):

@@ -49,23 +49,23 @@ class Flags(harness.Flags):
 
 
 @contextlib.contextmanager
-def served_robot():
-    """bam/pick behind the embedded server, in this process."""
+def served_robot(env_id="bam/pick-v0", env_kwargs=None):
+    """The robot of an environment behind the embedded server, in this process."""
     from bam_envs.remote.serve.serve_options import ServeOptions
     from bam_envs.remote.serve.served_environment import ServedEnvironment
     from bam_train.environments import make_env
 
-    with ServedEnvironment(make_env("bam/pick-v0", {}), ServeOptions(port=0)) as served:
+    with ServedEnvironment(make_env(env_id, env_kwargs or {}), ServeOptions(port=0)) as served:
         yield served
 
 
-def serve_cell(cameras, rate):
-    """bam/pick with cameras, on what is as good as another computer; a line with the time of each halt."""
+def serve_cell(cameras, rate, *env):
+    """A robot with cameras, on what is as good as another computer; a line with the time of each halt."""
     from bam_envs.ros.codec import HALT_TOPIC
 
     be_another_computer()
     images = itertools.cycle([jpeg(seed) for seed in range(8)])
-    with served_robot() as served:
+    with served_robot(*env) as served:
         bus = served.bus
         for topic in topics_of(cameras):
             bus.advertise(topic, "sensor_msgs/CompressedImage")
@@ -77,6 +77,23 @@ def serve_cell(cameras, rate):
 
         with every(1 / rate, film):
             until_the_end(bus.port)
+
+
+@contextlib.contextmanager
+def halting_cell(*what):
+    """`serve_cell` in a process of its own: the robot's address, and a queue of the times at which halts came."""
+    halts = queue.SimpleQueue()
+    with Peer(serve_cell, *what) as cell:
+        threading.Thread(target=lambda: [halts.put(float(line)) for line in cell.process.stdout], daemon=True).start()
+        yield f"ws://127.0.0.1:{cell.ports[0]}", halts
+
+
+def halt_after(halts, stop):
+    """The time of the press that `stop` returns, and of the halt that came after it."""
+    while not halts.empty():
+        halts.get()
+    begun = stop()
+    return begun, halts.get(timeout=60)
 
 
 def topics_of(cameras):
@@ -107,11 +124,11 @@ def busy(count):
 
 
 @contextlib.contextmanager
-def running_agent(folder, *flags):
+def running_agent(folder, *flags, policy=harness.PICK):
     """A bam-agent in a process of its own, once its policy drives; a client of it."""
     from bam_train.agent.remote.agent_client import AgentClient
 
-    command = program("live.live_agent", "--port", 0, "--folder", folder / "agent", "--policy", harness.PICK, *flags)
+    command = program("live.live_agent", "--port", 0, "--folder", folder / "agent", "--policy", policy, *flags)
     with (
         (folder / "said").open("w+") as said,
         subprocess.Popen(command, stderr=said, stdin=subprocess.DEVNULL) as agent,
@@ -150,15 +167,13 @@ def measure_stop(flags):
     """The stop button, while cameras stream."""
     from tests.bam_train.agent.browsers import new_browser
 
-    topics, halts = topics_of(flags.cameras), queue.SimpleQueue()
-    ordered, heard, answered = [], [], []
+    topics, ordered, heard, answered = topics_of(flags.cameras), [], [], []
     with contextlib.ExitStack() as stack:
-        cell = stack.enter_context(Peer(serve_cell, flags.cameras, flags.rate))
-        threading.Thread(target=lambda: [halts.put(float(line)) for line in cell.process.stdout], daemon=True).start()
+        url, halts = stack.enter_context(halting_cell(flags.cameras, flags.rate))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         cameras = [f'[[cameras]]\nname = "camera {n}"\ntopic = "{topic}"\n' for n, topic in enumerate(topics)]
         (folder / "cameras.toml").write_text(PROFILE + "".join(cameras))
-        robot = ("--robot", f"ws://127.0.0.1:{cell.ports[0]}", "--profile", folder / "cameras.toml", "--resume")
+        robot = ("--robot", url, "--profile", folder / "cameras.toml", "--resume")
         agent = stack.enter_context(running_agent(folder, *robot))
         browser = new_browser(logs=())
         stack.callback(browser.quit)
@@ -173,16 +188,18 @@ def measure_stop(flags):
         for number in range(flags.times(100)):
             resume(agent)
             time.sleep(0.2 + 0.01 * (number % 7))
-            while not halts.empty():
-                halts.get()
-            order = time.time()
-            browser.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": "mousePressed", **at})
-            halt = halts.get(timeout=60)
+
+            def press():
+                order = time.time()
+                browser.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": "mousePressed", **at})
+                return order
+
+            order, halt = halt_after(halts, press)
             browser.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": "mouseReleased", **at})
             until(lambda: agent.ask("status")["state"] == "paused", "no pause came")
-            press = browser.execute_script("return window.pressed") / 1e3
-            ordered.append(press - order)
-            heard.append(halt - press)
+            pressed = browser.execute_script("return window.pressed") / 1e3
+            ordered.append(pressed - order)
+            heard.append(halt - pressed)
             answered.append(float(re.search(r"after (\d+) ms", browser.execute_script(NOTE))[1]) / 1e3)
         drawn = (sum(browser.execute_script(DRAWN)) - before) / len(topics) / (time.monotonic() - begun)
     latencies = [one + other for one, other in zip(ordered, heard, strict=True)]

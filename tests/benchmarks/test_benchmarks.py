@@ -198,7 +198,11 @@ def test_data(bench):
 
 
 @pytest.mark.slow
-def test_agent(run):
+def test_agent(run, bench, chunk_checkpoint):
     status, out, err = run("agent", "--only", "memory", "--amount", 0.002)
     assert status in (0, 1), err
     assert re.search(r"^memory, 2,000 ticks, \d swaps +[+-][\d.]+ MB +<= 5 MB ", out, re.MULTILINE)
+    rows = bench("agent", "--only", "stop", "--chunks", chunk_checkpoint(size=60, steps=40))
+    assert [row[0] for row in rows] == ["stop to halt, ours", "stop to halt, chunks", "stop with chunks, of ours"]
+    text = "stop: --chunks act.zip measures a policy with chunks beside one of ours"
+    assert bench("agent", "--only", "stop") == [[text]]

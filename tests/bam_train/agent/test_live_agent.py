@@ -43,8 +43,12 @@ class Program:
         )
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
-        self.url = re.search(r"ws://\S+?(?=;)", self.line("listens on"))[0]
-        self.agent = AgentClient(self.url, name="anna@laptop").connect()
+        try:
+            self.url = re.search(r"ws://\S+?(?=;)", self.line("listens on"))[0]
+            self.agent = AgentClient(self.url, name="anna@laptop").connect()
+        except BaseException:
+            self.process.kill()  # nobody else knows of it, and its reader would not end
+            raise
 
     def _read(self):
         for line in self.process.stderr:
