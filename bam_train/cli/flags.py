@@ -435,6 +435,11 @@ class ExportConfig(RobotModelFlag):
     """What LeRobot's joints are in: degrees, -100 to 100 of their range (range), or radians and metres (si)."""
     data: Folder = None
     """LeRobot's data set, which names the numbers; by default where the policy was trained."""
+    served: bool = False
+    """LeRobot computes its chunks, on a policy server: the checkpoint has no network, and bam-serve --policy, on this
+    computer, serves it. For policies that are too large for a robot's computer, such as SmolVLA."""
+    task: Annotated[str, tyro.conf.arg(metavar="TEXT")] = ""
+    """What a policy of LeRobot is told to do, if it reads that, as in its data set."""
     statistics: File = None
     """File of a VecNormalize, for a zip of stable-baselines3."""
     algo: Name = None

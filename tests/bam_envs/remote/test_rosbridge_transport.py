@@ -151,12 +151,12 @@ def test_an_environment_that_is_not_there(served, open_to, channel):
     assert open_to(env_id="Pick", channel=channel).connect().env_id == "bam/pick-v0"
 
 
-def test_nothing_is_served_in_that_namespace(served, open_to):
+def test_nothing_is_served_in_that_namespace(server, served, open_to):
     served(MirrorEnv(spaces.Discrete(3)))
     with pytest.raises(NoServer) as error:
         open_to("bam_002").connect()
     assert "/bam_002/gym_env/gym_api_request does not exist. " in str(error.value)
-    assert "It is there at another address: ws://HOST:PORT/bam_001. Start one: bam-serve" in str(error.value)
+    assert f"It is there at another address: {server.url}/bam_001. Start one: bam-serve" in str(error.value)
     assert str(error.value).endswith("Start one: bam-serve --env bam/pick --namespace bam_002")
 
 
