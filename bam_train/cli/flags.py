@@ -423,6 +423,12 @@ class ExportConfig(RobotModelFlag):
       bam-export ray_results/run/checkpoint_000010 --trust-pickle
     """
 
+    GROUPS: ClassVar[Groups] = {
+        "The checkpoint": ("env", "robot_model", "set", "out", "force"),
+        "A policy of LeRobot": ("units", "data", "served", "task"),
+        "A policy of stable-baselines3 or RLlib": ("algo", "policy", "statistics", "trust_pickle"),
+    }
+
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
     """LeRobot's folder pretrained_model, a TOML file that describes an ONNX file, a zip of stable-baselines3, or a
     directory of RLlib: of algo.save_to_path or algo.save, or the folder of a policy in it. A word says which, if the
