@@ -216,6 +216,7 @@ class BamKeys(Teleoperator):  # type: ignore[misc]
     config_class, name = BamKeysConfig, "bam_keys"
     feedback_features: ClassVar[dict[str, type]] = {}
     is_calibrated = True
+    is_connected = False
 
     def __init__(self, config: BamKeysConfig) -> None:
         super().__init__(config)
@@ -227,13 +228,12 @@ class BamKeys(Teleoperator):  # type: ignore[misc]
         """Those of the arm."""
         return {} if self._arm is None else dict(self._arm.action_features)
 
-    @property
-    def is_connected(self) -> bool:
-        """Whether `disconnect` has anything to do."""
-        return self._arm is not None
-
     def connect(self, calibrate: bool = True) -> None:
-        """Read the terminal and look for a gamepad."""
+        """Nothing yet: LeRobot's programs connect the arm after it, which may ask on the terminal."""
+        self.is_connected = True
+
+    def _begin(self) -> None:
+        """Read the terminal and look for a gamepad, with the arm that is connected now."""
         if BamArm.connected is None:
             raise ResetNeeded("bam_keys moves the tool of a bam_arm. Connect one first: --robot.type=bam_arm")
         self._arm = BamArm.connected
@@ -249,6 +249,8 @@ class BamKeys(Teleoperator):  # type: ignore[misc]
 
     def get_action(self) -> dict[str, float]:
         """Positions of the joints one step on, or those that hold the arm."""
+        if self._arm is None:
+            self._begin()
         if self._terminal is not None:
             self._terminal.wait(0.0)
             for key, at, _ in self._terminal.take():
@@ -266,4 +268,4 @@ class BamKeys(Teleoperator):  # type: ignore[misc]
     def disconnect(self) -> None:
         """Give the terminal back."""
         self._stack.close()
-        self._arm = None
+        self._arm, self.is_connected = None, False

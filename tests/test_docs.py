@@ -260,7 +260,18 @@ def test_commands_exist(page):
             path = words[2].replace(".", "/") if words[1] == "-m" else words[1]
             assert (ROOT / path).exists() or f"`{words[1]}`" in page.read_text()
         else:
-            assert words[0] in {*PROGRAMS, "lerobot-record", "pip", "pytest", "python3", "ray", "ros2", "source", "ssh"}
+            assert words[0] in {
+                *PROGRAMS,
+                "lerobot-record",
+                "lerobot-rollout",
+                "pip",
+                "pytest",
+                "python3",
+                "ray",
+                "ros2",
+                "source",
+                "ssh",
+            }
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/reference-programs.md"])

@@ -25,10 +25,10 @@ def export_policy(config: ExportConfig) -> None:
     from bam_train.trainers.best_checkpoint import FOLDER, require_output
 
     kind, path = _kind(config.source)
-    meant = {"rllib": ("policy",), "lerobot": ("data", "units"), "sb3": ("statistics",)}
+    meant = {"rllib": ("policy",), "lerobot": ("data", "units", "served", "task"), "sb3": ("statistics",)}
     for other, names in meant.items():
         for name in names:
-            if kind != other and getattr(config, name) is not None:
+            if kind != other and getattr(config, name):
                 raise SettingsError(f"--{name} is for {other}, and {config.source} is read as {kind}; leave it out")
     require_output(config.out or FOLDER / "policy.zip")  # not after the work
     make = {"rllib": _directory, "sb3": _zip}.get(kind, partial(_network, kind=kind))
@@ -60,7 +60,7 @@ def _network(config: ExportConfig, kind: str, path: Path) -> Exported:
     if kind == "lerobot":
         from bam_train.compat.lerobot_folder import lerobot_policy
 
-        policy = lerobot_policy(path, data=config.data, units=config.units)
+        policy = lerobot_policy(path, data=config.data, units=config.units, served=config.served, task=config.task)
     else:
         from bam_train.compat.foreign_policy import described_policy
 
@@ -104,6 +104,7 @@ def _directory(config: ExportConfig, path: Path) -> Exported:
 
 def _write(config: ExportConfig, exported: Exported) -> None:
     """Write the checkpoint, and say what it is and what comes next."""
+    from bam_train.checkpoint import POLICY
     from bam_train.compat.exported import EXPORTED
     from bam_train.environments import must_be_named
     from bam_train.settings import TrainSettings
@@ -123,13 +124,18 @@ def _write(config: ExportConfig, exported: Exported) -> None:
     resume = [f"            bam-train --resume {named} --steps N"]
     if exported.cannot_resume:
         resume = [f"  bam-train --resume cannot go on from it: {exported.cannot_resume}"] if trainer == "rllib" else []
-    live = trainer in ("lerobot", "onnx")
+    next_ = [f"  next      bam-eval {named}, bam-deploy {named}"]
+    if trainer in ("lerobot", "onnx"):
+        next_ = [f"  next      bam-deploy {named}, bam-deploy {named} --robot URL --shadow"]
+    if POLICY not in exported.members:
+        next_ = [
+            f"  next      bam-serve --policy {path} --bind ADDRESS --port 9096, on this computer; at the robot, with",
+            f"            the same file, bam-deploy {named} --policy-server ws://ADDRESS:9096",
+        ]
     tell(
         f"{path}: {algo} on {env}{several}{steps}, out of {exported.place}{f' of Ray {ray}' if ray else ''}",
         f"  checked   against the actions of {exported.checked_by}: they differ by {exported.difference:.1e} at most",
-        f"  next      bam-deploy {named}, bam-deploy {named} --robot URL --shadow"
-        if live
-        else f"  next      bam-eval {named}, bam-deploy {named}",
+        *next_,
         *resume,
     )
 

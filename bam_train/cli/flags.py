@@ -423,6 +423,12 @@ class ExportConfig(RobotModelFlag):
       bam-export ray_results/run/checkpoint_000010 --trust-pickle
     """
 
+    GROUPS: ClassVar[Groups] = {
+        "The checkpoint": ("env", "robot_model", "set", "out", "force"),
+        "A policy of LeRobot": ("units", "data", "served", "task"),
+        "A policy of stable-baselines3 or RLlib": ("algo", "policy", "statistics", "trust_pickle"),
+    }
+
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
     """LeRobot's folder pretrained_model, a TOML file that describes an ONNX file, a zip of stable-baselines3, or a
     directory of RLlib: of algo.save_to_path or algo.save, or the folder of a policy in it. A word says which, if the
@@ -435,6 +441,11 @@ class ExportConfig(RobotModelFlag):
     """What LeRobot's joints are in: degrees, -100 to 100 of their range (range), or radians and metres (si)."""
     data: Folder = None
     """LeRobot's data set, which names the numbers; by default where the policy was trained."""
+    served: bool = False
+    """LeRobot computes its chunks, on a policy server: the checkpoint has no network, and bam-serve --policy, on this
+    computer, serves it. For policies that are too large for a robot's computer, such as SmolVLA."""
+    task: Annotated[str, tyro.conf.arg(metavar="TEXT")] = ""
+    """What a policy of LeRobot is told to do, if it reads that, as in its data set."""
     statistics: File = None
     """File of a VecNormalize, for a zip of stable-baselines3."""
     algo: Name = None

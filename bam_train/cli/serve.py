@@ -54,7 +54,7 @@ def _tell(line: str) -> None:
 
 def _served_policy(config: ServeConfig, path: Path) -> Any:
     """The policy of a checkpoint as an environment."""
-    from bam_train.checkpoint import Checkpoint
+    from bam_train.checkpoint import POLICY, Checkpoint
     from bam_train.errors import PolicyError, SettingsError
     from bam_train.policy import FrozenPolicy
     from bam_train.policy.chunks import ONE_BY_ONE
@@ -62,7 +62,13 @@ def _served_policy(config: ServeConfig, path: Path) -> Any:
 
     if config.set or config.robot_model is not None or config.num_envs > 1:
         raise SettingsError("--policy serves a policy, and no environment: leave out --set, --robot-model, --num-envs")
-    policy = FrozenPolicy.from_checkpoint(Checkpoint.open(path), threads=0)
+    checkpoint = Checkpoint.open(path)
+    if checkpoint.has(POLICY):
+        policy = FrozenPolicy.from_checkpoint(checkpoint, threads=0)
+    else:
+        from bam_train.compat.foreign_export import served_policy
+
+        policy = served_policy(checkpoint)
     if policy.chunk is None:
         raise PolicyError(f"{path}: {ONE_BY_ONE}. Run it beside the robot: bam-deploy {path}")
     return ServedPolicy(policy)

@@ -55,7 +55,7 @@ def exported(
     Args:
         place: See `Exported`.
         policy: The policy, which `graph` is.
-        graph: The ONNX file.
+        graph: The ONNX file; b"": its own library computes it, on a policy server.
         golden: Observations, and the actions that `checked_by` computed for them.
         source: Where it comes from, for the manifest.
         checked_by: See `Exported`.
@@ -75,6 +75,7 @@ def exported(
     if not worst <= TOLERANCE:  # NaN too
         text = f"its frozen policy differs by {worst:.3g} in row {row} from the actions of {checked_by}"
         raise PolicyError(f"{place}: {text}, expected at most {TOLERANCE}: this network cannot be exported")
+    members = {GOLDEN: safetensors_file.dump(golden), **({POLICY: graph} if graph else {})}
     fields = {
         "observation_space": policy.observation_space,
         "action_space": policy.action_space,
@@ -86,4 +87,4 @@ def exported(
         **fields,
         **origin(),
     }
-    return Exported(place, policy, fields, {POLICY: graph, GOLDEN: safetensors_file.dump(golden)}, checked_by, worst)
+    return Exported(place, policy, fields, members, checked_by, worst)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,15 +16,16 @@ from numpy.typing import NDArray
 from bam_envs.core.registry import entry_of
 from bam_envs.core.robot_models import portable_model
 from bam_envs.core.spaces import space_to_json
+from bam_train.checkpoint import Checkpoint
 from bam_train.checkpoint.detector import DETECTOR, MOST_NUMBERS, Detector, detector_of_ranges
-from bam_train.compat.exported import Exported, exported
+from bam_train.compat.exported import EXPORTED, Exported, exported
 from bam_train.compat.foreign_graph import as_ours, as_theirs, mapped_graph, with_known_sizes
 from bam_train.compat.foreign_policy import ForeignPolicy, Meaning, Port, fit_rows, meaning, part_key, part_of
 from bam_train.deploy.contract import Contract
 from bam_train.environments import described, make_env
-from bam_train.errors import ContractRefused, PolicyError
+from bam_train.errors import CheckpointError, ContractRefused, PolicyError
 from bam_train.policy import FrozenPolicy
-from bam_train.policy.onnx_session import OnnxSession
+from bam_train.policy.onnx_session import OnnxSession, Tensor
 
 Array = NDArray[Any]
 _ROWS, _BUDGET = 64, 200_000  # golden observations: at most so many, and about so many bytes, but 4
@@ -49,8 +51,45 @@ def export_foreign(
         ContractRefused: A joint is missing, or named twice; the rate or an image differs.
         PolicyError: Its graph cannot be used, or does not act as its own library does.
     """
-    policy = with_known_sizes(policy)
+    policy = with_known_sizes(policy) if policy.network else policy
     env_kwargs = {**_usual(policy, env_id), **env_kwargs}
+    session, frozen, graph, (signals, period) = _joined(policy, env_id, env_kwargs, tell)
+    golden = _golden(session)
+    facts = {"env": env_id, "env_kwargs": _portable(env_kwargs), "signals": signals, "period": period}
+    facts |= {"algorithm": policy.algorithm, "trainer": policy.trainer, "steps": policy.steps}
+    made = exported(policy.place, frozen, graph, golden, policy.source, policy.by, **facts)
+    detector = _detector(policy, session.taken, session.given, math.prod(session.shape))
+    return made if detector is None else replace(made, members={**made.members, DETECTOR: detector.to_bytes()})
+
+
+def served_policy(checkpoint: Checkpoint) -> FrozenPolicy:
+    """The policy of a checkpoint without a graph: its own library computes the chunks.
+
+    Raises:
+        CheckpointError: It is not where it was exported from.
+        PolicyError: It does not act as it did.
+    """
+    from bam_train.compat.lerobot_folder import lerobot_policy
+
+    manifest = checkpoint.manifest
+    source = manifest.settings[EXPORTED]
+    folder, data = Path(source["directory"]), Path(source["data"])
+    if not folder.is_dir():
+        text = f"LeRobot computes its chunks, out of {folder}, which is not there. Export it again, on this computer"
+        raise CheckpointError(checkpoint.path, text)
+    policy = lerobot_policy(folder, data=data, units=source["units"], served=True, task=source["task"])
+    _, frozen, _, _ = _joined(policy, manifest.env, manifest.env_kwargs)
+    frozen.require_golden(checkpoint)
+    return frozen
+
+
+def _joined(
+    policy: ForeignPolicy,
+    env_id: str,
+    env_kwargs: Mapping[str, Any],
+    tell: Callable[[str], None] = lambda text: None,
+) -> tuple[LibrarySession, FrozenPolicy, bytes, tuple[dict[str, Any], float | None]]:
+    """A policy in an environment: by its library and frozen, its graph, and the environment's signals and period."""
     with contextlib.closing(make_env(env_id, env_kwargs)) as env:
         signals, period = described(env)
         contract = Contract(tuple(fit_rows(policy, env, period)))
@@ -65,20 +104,46 @@ def export_foreign(
     if not isinstance(action, spaces.Box):
         raise PolicyError(f"{policy.place}: {env_id} takes {action}, and policies of others give numbers")
     taken, given = _meanings(policy, observation, signals), meaning(policy.output, *_numbers(signals, "action"))
-    graph = mapped_graph(policy, [taken[port.name] for port in policy.inputs], (action, given))
+    inputs = [taken[port.name] for port in policy.inputs]
+    graph = mapped_graph(policy, inputs, (action, given)) if policy.network else b""
     jsons = space_to_json(observation), space_to_json(action)
     try:
         if policy.answer is None:
             _require_described(policy)
-        frozen = FrozenPolicy.from_graph(graph, *jsons, chunk=policy.chunk)
+        session = LibrarySession(policy, taken, given, action.shape)
+        if policy.network:
+            frozen = FrozenPolicy.from_graph(graph, *jsons, chunk=policy.chunk)
+        else:
+            frozen = FrozenPolicy(session, *jsons, policy.chunk)
     except PolicyError as error:
         raise PolicyError(f"{policy.place}: {error}") from error
-    golden = _golden(policy, taken, given, action.shape)
-    facts = {"env": env_id, "env_kwargs": _portable(env_kwargs), "signals": signals, "period": period}
-    facts |= {"algorithm": policy.algorithm, "trainer": policy.trainer, "steps": policy.steps}
-    made = exported(policy.place, frozen, graph, golden, policy.source, policy.by, **facts)
-    detector = _detector(policy, taken, given, action)
-    return made if detector is None else replace(made, members={**made.members, DETECTOR: detector.to_bytes()})
+    return session, frozen, graph, (signals, period)
+
+
+class LibrarySession:
+    """Computes a policy of others by its own library, in the place of an `OnnxSession`: one observation, one chunk."""
+
+    outputs = ("action",)
+    slow = OnnxSession.slow
+
+    def __init__(
+        self,
+        policy: ForeignPolicy,
+        taken: Mapping[str, tuple[str, Any, Meaning]],
+        given: Meaning,
+        shape: tuple[int, ...],
+    ) -> None:
+        self.policy, self.taken, self.given, self.shape = policy, taken, given, shape
+        self._answer = policy.answer or _graph(policy)
+        past = (policy.chunk.history,) if policy.chunk.history > 1 else ()
+        parts = taken.values()
+        self.inputs = {name: Tensor((1, *past, *part.shape), part.dtype.name) for name, part, _ in parts}
+
+    def run(self, inputs: Mapping[str, Array], _: Sequence[str]) -> list[Array]:
+        """The chunk, (1, size, ...), for arrays (1, ...)."""
+        ours = {name: (inputs[ours], means) for name, (ours, _, means) in self.taken.items()}
+        chunk = np.asarray(self._answer(as_theirs(self.policy, ours)))
+        return [as_ours(self.policy, chunk, self.given, self.shape)[None]]
 
 
 def _usual(policy: ForeignPolicy, env_id: str) -> dict[str, Any]:
@@ -96,13 +161,13 @@ def _usual(policy: ForeignPolicy, env_id: str) -> dict[str, Any]:
 
 
 def _detector(
-    policy: ForeignPolicy, taken: Mapping[str, tuple[str, Any, Meaning]], given: Meaning, action: spaces.Box
+    policy: ForeignPolicy, taken: Mapping[str, tuple[str, Any, Meaning]], given: Meaning, count: int
 ) -> Detector | None:
     """The detector of unusual observations, of the ranges of the numbers in the data; None if they are not known."""
     seen = sorted((taken[port.name], port) for port in policy.inputs if not port.is_image)
     ranges = [_range(port, means, math.prod(part.shape)) for (_, part, means), port in seen]
     d = sum(len(low) for low, _ in ranges)
-    low, high = np.concatenate([*ranges, _range(policy.output, given, math.prod(action.shape))], axis=1)
+    low, high = np.concatenate([*ranges, _range(policy.output, given, count)], axis=1)
     few = 0 < d <= MOST_NUMBERS and len(low) - d <= MOST_NUMBERS
     return detector_of_ranges(low, high, d) if few and np.isfinite(low).any() else None
 
@@ -149,10 +214,9 @@ def _meanings(
     return found
 
 
-def _golden(
-    policy: ForeignPolicy, taken: Mapping[str, tuple[str, Any, Meaning]], given: Meaning, shape: tuple[int, ...]
-) -> dict[str, Array]:
+def _golden(session: LibrarySession) -> dict[str, Array]:
     """Observations about as those that it was trained on, and its own chunks for them."""
+    policy, taken = session.policy, session.taken
     rng, past = np.random.default_rng(0), (policy.chunk.history,) if policy.chunk.history > 1 else ()
     size = sum(math.prod(part.shape) * part.dtype.itemsize for _, part, _ in taken.values()) * policy.chunk.history
     rows, arrays = max(4, min(_ROWS, _BUDGET // size)), {}
@@ -164,12 +228,7 @@ def _golden(
         drawn = np.zeros((rows, *past, *part.shape))
         drawn[..., means.order] = means.si(port.data(rng.normal(size=(rows, *past, len(means.order)))))
         arrays[name] = np.clip(drawn, part.low, part.high).astype(part.dtype)
-    answer = policy.answer or _graph(policy)
-    chunks = []
-    for k in range(rows):
-        one = {name: (arrays[ours][k : k + 1], means) for name, (ours, _, means) in taken.items()}
-        chunk = as_ours(policy, np.asarray(answer(as_theirs(policy, one))), given, shape)
-        chunks.append(chunk)
+    chunks = [session.run({name: array[k : k + 1] for name, array in arrays.items()}, ())[0][0] for k in range(rows)]
     return {**arrays, "action": np.stack(chunks)}
 
 

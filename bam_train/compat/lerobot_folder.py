@@ -1,6 +1,7 @@
-"""Policies that LeRobot trained: the folder ``pretrained_model`` of ACT or Diffusion, with its statistics.
+"""Policies that LeRobot trained: the folder ``pretrained_model``, with its statistics.
 
-LeRobot itself makes the network and computes the actions to compare with; it is not needed where the policy runs.
+The network of ACT or Diffusion is exported: LeRobot makes it, computes the actions to compare with, and is not needed
+where the policy runs. Any policy with chunks is served: LeRobot computes them on a policy server.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ Norm = tuple[Array, Array, Array, Array]
 KINDS = {"act": "ACTPolicy", "diffusion": "DiffusionPolicy"}
 """Policies that are exported, and their classes."""
 LARGE = ("smolvla", "pi0", "pi05", "pi0_fast", "groot", "xvla", "wall_x")
-"""Policies that take seconds for a chunk on a CPU."""
+"""Policies that take seconds for a chunk on a CPU: they are served."""
 _ACTION, _STATE, _IMAGES = "action", "observation.state", "observation.images."
 _STEPS = {
     *("rename_observations_processor", "to_batch_processor", "device_processor", "normalizer_processor"),
@@ -40,13 +41,17 @@ _STEPS = {
 _ENDS = {"MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q10", "q90")}
 
 
-def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | None = None) -> ForeignPolicy:
+def lerobot_policy(
+    folder: Path, *, data: Path | None = None, units: Units | None = None, served: bool = False, task: str = ""
+) -> ForeignPolicy:
     """The policy in a folder ``pretrained_model``.
 
     Args:
         folder: The folder.
         data: The data set that it learnt from, which has the names of the numbers; by default where it was.
         units: What joints are measured in: degrees, or -100 to 100 of their range; a gripper is 0 to 100 in both.
+        served: Whether LeRobot computes its chunks where it runs, instead of a graph.
+        task: What it is told to do, if it reads that.
 
     Raises:
         CheckpointError: The folder is missing, or has no policy of LeRobot in it.
@@ -55,16 +60,10 @@ def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | Non
     """
     folder = folder.expanduser()
     config = _json(folder, "config.json")
-    kind = str(config.get("type", "that config.json does not name (type)"))
-    if kind in LARGE:
-        text = f"{kind} takes seconds for a chunk on a robot's computer: run it on a policy server with a GPU"
-        raise CheckpointMismatch(folder, f"{text}; bam-export takes {' and '.join(KINDS)}")
-    if kind not in KINDS:
-        raise CheckpointMismatch(folder, f"is a policy of the kind {kind}; bam-export takes {' and '.join(KINDS)}")
-    if (scheduler := config.get("noise_scheduler_type", "DDIM")) != "DDIM":
-        text = f"noise_scheduler_type is {scheduler}, which draws noise in every step. In config.json"
-        raise CheckpointMismatch(folder, f'{text} set it to "DDIM", and num_inference_steps to about 10')
-    steps = {name: _steps(folder, f"policy_{name}.json") for name in ("preprocessor", "postprocessor")}
+    kind = _kind(folder, config, served)
+    steps = {name: _steps(folder, f"policy_{name}.json", served) for name in ("preprocessor", "postprocessor")}
+    if not task and any("tokenizer" in str(step.get("registry_name")) for step in steps["preprocessor"]):
+        raise SettingsError(f"{folder}: {kind} reads what it is to do. Say it: --task TEXT, as in its data set")
     renamed = {old: new for step in steps["preprocessor"] for old, new in step["config"].get("rename_map", {}).items()}
     info, root = _data_set(folder, data)
     ours = DataSet.open(root).info if (root / "meta/bam.json").is_file() else None
@@ -73,27 +72,29 @@ def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | Non
             "its joints may be measured in degrees, or from -100 to 100. Say which: --units degrees, or --units range"
         )
         raise SettingsError(f"{folder}: {text}")
-    network = _Network(folder, kind)
+    theirs = {new: old for old, new in renamed.items()}
+    network = _Library(folder, kind, task, theirs) if served else _Network(folder, kind)
     norms = {name: _norms(folder, found) for name, found in steps.items()}
 
     def port(feature: str, shape: tuple[int, ...], norm: Norm) -> Port:
-        there = next((old for old, new in renamed.items() if new == feature), feature)
+        there = theirs.get(feature, feature)
         part = there.removeprefix(_IMAGES).removeprefix("observation.")
         mean, std, *ends = (tuple(one * (PIXEL if len(shape) == 3 else 1.0)) for one in norm)
         names = () if ours is not None or len(shape) == 3 else _names(folder, info, there)
-        return Port(feature, part, shape, names, units or "si", mean, std, *(ends if len(shape) == 1 else ()))
+        normal = ((), ()) if served else (mean, std)  # LeRobot's processors do it there
+        return Port(feature, part, shape, names, units or "si", *normal, *(ends if len(shape) == 1 else ()))
 
     inputs = [port(name, shape, norms["preprocessor"](name, shape)) for name, shape in network.features.items()]
     output = port(_ACTION, network.shape, norms["postprocessor"](_ACTION, network.shape))
-    try:
-        graph = trace(network, network.example(), [*network.features], [_ACTION], any_number=False)
-    except (RuntimeError, TypeError, ValueError) as error:
-        why = f"{type(error).__name__} {' '.join(str(error).split()):.160}"
-        raise CheckpointMismatch(folder, f"its network cannot be exported: {why}") from error
-    source = {"directory": str(folder.absolute()), "lerobot": network.version, "data": str(root.absolute())}
+    source: dict[str, Any] = {
+        "directory": str(folder.absolute()),
+        "lerobot": network.version,
+        "data": str(root.absolute()),
+    }
+    source |= {"units": units, "task": task} if served else {}
     return ForeignPolicy(
         str(folder),
-        graph,
+        network.graph(folder),
         tuple(inputs),
         output,
         network.chunk,
@@ -106,6 +107,76 @@ def lerobot_policy(folder: Path, *, data: Path | None = None, units: Units | Non
         env=ours.env if ours is not None else None,
         env_kwargs=ours.env_kwargs if ours is not None else {},
     )
+
+
+def _kind(folder: Path, config: Mapping[str, Any], served: bool) -> str:
+    """The kind of a policy; CheckpointMismatch unless it can be exported, or served."""
+    kind, both = str(config.get("type", "that config.json does not name (type)")), " and ".join(KINDS)
+    if served and (config.get("n_obs_steps") != 1 or "chunk_size" not in config):
+        text = f"{kind} has no chunks for a single observation, and cannot be served"
+        raise CheckpointMismatch(folder, f"{text}; {both} are exported without --served")
+    if kind in LARGE and not served:
+        text = f"{kind} takes seconds for a chunk on a robot's computer. Add --served, on a computer with a GPU, for a"
+        raise CheckpointMismatch(folder, f"{text} checkpoint that bam-serve --policy serves there with LeRobot")
+    if kind not in (*KINDS, *LARGE):
+        raise CheckpointMismatch(folder, f"is a policy of the kind {kind}; bam-export takes {both}")
+    if not served and (scheduler := config.get("noise_scheduler_type", "DDIM")) != "DDIM":
+        text = f"noise_scheduler_type is {scheduler}, which draws noise in every step. In config.json"
+        raise CheckpointMismatch(folder, f'{text} set it to "DDIM", and num_inference_steps to about 10')
+    return kind
+
+
+def _loaded(folder: Path, kind: str) -> Any:
+    """The policy, as LeRobot makes it."""
+    try:
+        if kind in KINDS:
+            made = getattr(import_module(f"lerobot.policies.{kind}.modeling_{kind}"), KINDS[kind])
+        else:
+            made = import_module("lerobot.policies.factory").get_policy_class(kind)
+        config = import_module("lerobot.configs.policies").PreTrainedConfig.from_pretrained(folder)
+        if kind in KINDS:
+            config.pretrained_backbone_weights = None  # else they are downloaded, and then replaced by its own
+        return made.from_pretrained(folder, config=config)
+    except ImportError as error:
+        text = f"{folder}: LeRobot makes the network, and {error.name or 'lerobot'} is not installed"
+        raise SettingsError(f'{text}. Run: pip install "lerobot{"" if kind in KINDS else f"[{kind}]"}"') from error
+
+
+def _features(config: Any) -> dict[str, tuple[int, ...]]:
+    """The shape of each feature that a policy takes."""
+    features = {**config.image_features}
+    features |= {_STATE: config.robot_state_feature} if config.robot_state_feature else {}
+    features |= {"observation.environment_state": config.env_state_feature} if config.env_state_feature else {}
+    return {name: tuple(one.shape) for name, one in features.items()}
+
+
+class _Library:
+    """LeRobot's policy between its own processors: an observation as in the data to a chunk of actions as in the data.
+
+    Noise that it draws is the same for each chunk, so that its actions can be compared.
+    """
+
+    def __init__(self, folder: Path, kind: str, task: str, theirs: Mapping[str, str]) -> None:
+        self._policy, self._task, self._theirs = _loaded(folder, kind).eval(), task, theirs
+        config, self.version = self._policy.config, version("lerobot")
+        own = {"device_processor": {"device": str(config.device)}}
+        make = import_module("lerobot.policies.factory").make_pre_post_processors
+        self._before, self._after = make(config, pretrained_path=str(folder), preprocessor_overrides=own)
+        self.features, self.shape = _features(config), tuple(config.action_feature.shape)
+        ensemble = getattr(config, "temporal_ensemble_coeff", None)
+        self.chunk = Chunk(config.chunk_size, config.n_action_steps, 1, ensemble)
+
+    def graph(self, folder: Path) -> bytes:
+        """None: LeRobot computes."""
+        return b""
+
+    def answer(self, inputs: Mapping[str, Array]) -> Array:
+        """The chunk for arrays (1, ...) by feature."""
+        frame: dict[str, Any] = {self._theirs.get(name, name): torch.tensor(inputs[name][0]) for name in self.features}
+        torch.manual_seed(0)
+        with torch.no_grad():
+            chunk = self._policy.predict_action_chunk(self._before({**frame, "task": self._task}))
+            return np.asarray(self._after(chunk[0]).cpu().numpy(), np.float32)[None]
 
 
 class _CenterCrop(Layer):
@@ -126,20 +197,10 @@ class _Network(Layer):
 
     def __init__(self, folder: Path, kind: str) -> None:
         super().__init__()
-        try:
-            module = import_module(f"lerobot.policies.{kind}.modeling_{kind}")
-            config = import_module("lerobot.configs.policies").PreTrainedConfig.from_pretrained(folder)
-        except ImportError as error:
-            text = f"{folder}: LeRobot makes the network, and {error.name or 'lerobot'} is not installed"
-            raise SettingsError(f'{text}. Run: pip install "lerobot"') from error
-        config.pretrained_backbone_weights = None  # else they are downloaded, and then replaced by the policy's own
-        policy = getattr(module, KINDS[kind]).from_pretrained(folder, config=config)
+        policy = _loaded(folder, kind)
         config, self.version = policy.config, version("lerobot")
         self.images, self.shape = list(config.image_features), tuple(config.action_feature.shape)
-        features = {**config.image_features}
-        features |= {_STATE: config.robot_state_feature} if config.robot_state_feature else {}
-        features |= {"observation.environment_state": config.env_state_feature} if config.env_state_feature else {}
-        self.features = {name: tuple(one.shape) for name, one in features.items()}
+        self.features = _features(config)
         self.noise: torch.Tensor | None = None
         if kind == "act":
             self.model: nn.Module = policy.model.cpu()
@@ -153,10 +214,15 @@ class _Network(Layer):
             self.noise = torch.randn(1, config.horizon, *self.shape, generator=torch.Generator().manual_seed(0))
         self.eval()
 
-    def example(self) -> tuple[torch.Tensor, ...]:
-        """One observation of zeros."""
+    def graph(self, folder: Path) -> bytes:
+        """The ONNX file; CheckpointMismatch if it has operations that are not exported."""
         past = [self.chunk.history] if self.chunk.history > 1 else []
-        return tuple(torch.zeros(1, *past, *shape) for shape in self.features.values())
+        zeros = tuple(torch.zeros(1, *past, *shape) for shape in self.features.values())
+        try:
+            return trace(self, zeros, [*self.features], [_ACTION], any_number=False)
+        except (RuntimeError, TypeError, ValueError) as error:
+            why = f"{type(error).__name__} {' '.join(str(error).split()):.160}"
+            raise CheckpointMismatch(folder, f"its network cannot be exported: {why}") from error
 
     def forward(self, *features: torch.Tensor) -> torch.Tensor:
         """The chunk, (1, size, k)."""
@@ -181,7 +247,7 @@ class _Network(Layer):
 
 def _norms(folder: Path, steps: list[dict[str, Any]]) -> Any:
     """A function of a feature and its shape: how a processor normalises it."""
-    found = [step for step in steps if step["registry_name"].endswith("normalizer_processor")]
+    found = [step for step in steps if str(step.get("registry_name")).endswith("normalizer_processor")]
 
     def norm(feature: str, shape: tuple[int, ...]) -> Norm:
         mean, std, ends = np.zeros(shape[0]), np.ones(shape[0]), (np.zeros(0), np.zeros(0))
@@ -214,10 +280,10 @@ def _statistics(folder: Path, name: str) -> dict[str, Array]:
         raise CheckpointError(folder, f"{name} cannot be read: {error}", member=name) from error
 
 
-def _steps(folder: Path, name: str) -> list[dict[str, Any]]:
-    """The steps of a processor; each of them must be known."""
+def _steps(folder: Path, name: str, served: bool) -> list[dict[str, Any]]:
+    """The steps of a processor; each of them must be known, unless LeRobot computes them."""
     steps: list[dict[str, Any]] = _json(folder, name)["steps"]
-    for step in steps:
+    for step in [] if served else steps:
         if step.get("registry_name") not in _STEPS:
             found = step.get("registry_name") or step.get("class")
             raise CheckpointMismatch(folder, f"{name} has the step {found}, which is not known here")

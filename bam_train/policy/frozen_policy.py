@@ -19,7 +19,7 @@ from bam_train.errors import FormatError, PolicyError
 from bam_train.policy.chunks import ONE_BY_ONE, Plan
 
 if TYPE_CHECKING:
-    from bam_train.policy.onnx_session import OnnxSession
+    from bam_train.policy.onnx_session import PolicyRunner
     from bam_train.policy.policy_link import PolicyLink
 
 TOLERANCE = 1e-5
@@ -115,7 +115,7 @@ class FrozenPolicy:
 
     def __init__(
         self,
-        session: OnnxSession | PolicyLink,
+        session: PolicyRunner,
         observation_space: Mapping[str, Any],
         action_space: Mapping[str, Any],
         chunk: Chunk | None = None,
@@ -161,6 +161,9 @@ class FrozenPolicy:
         """Load the policy of an open checkpoint, or have a `server` run it, which must act as the checkpoint's."""
         manifest = checkpoint.manifest
         spaces, chunk = (manifest.observation_space, manifest.action_space), manifest.chunk
+        if server is None and not checkpoint.has(POLICY):
+            text = "its own library computes its actions, where it was exported: run bam-serve --policy there"
+            raise PolicyError(f"{checkpoint.path}: {text}, and give its address: --policy-server")
         if server is None:
             policy = cls.from_graph(checkpoint.read(POLICY), *spaces, chunk=chunk, threads=threads)
         elif chunk is None:
@@ -376,7 +379,7 @@ def _int64(array: np.ndarray) -> np.ndarray:
     return array.view(np.int64) if array.dtype.char == "q" else array
 
 
-def _require_fit(session: OnnxSession | PolicyLink, arrays: list[ArraySpec], states: Mapping[str, Any]) -> None:
+def _require_fit(session: PolicyRunner, arrays: list[ArraySpec], states: Mapping[str, Any]) -> None:
     """Refuse a graph whose inputs are not the observation space's arrays, or that lacks an output."""
     names = session.inputs.keys() - states.keys()
     if names != {part.name for part in arrays}:

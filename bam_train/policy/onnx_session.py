@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import onnxruntime
@@ -42,6 +42,25 @@ class Tensor:
     """None where the length is free, such as that of the batch axis."""
     dtype: str
     """Name of the NumPy dtype."""
+
+
+class PolicyRunner(Protocol):
+    """What computes actions: a graph, the library of a policy, or a policy server."""
+
+    @property
+    def slow(self) -> str:
+        """What to say of a late chunk."""
+
+    @property
+    def inputs(self) -> Mapping[str, Tensor]:
+        """The policy's inputs, by name."""
+
+    @property
+    def outputs(self) -> Sequence[str]:
+        """Names of its outputs."""
+
+    def run(self, inputs: Mapping[str, Any], outputs: Sequence[str], /) -> list[Any]:
+        """The named outputs, (n, ...), for every input by name, (n, ...)."""
 
 
 class OnnxSession:

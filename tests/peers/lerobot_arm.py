@@ -19,7 +19,9 @@ def refused(call, *arguments):
 
 
 refused(arm.get_observation)
-refused(BamKeys(BamKeysConfig()).connect)
+keys = BamKeys(BamKeysConfig())
+keys.connect()  # before the arm, as LeRobot does
+refused(keys.get_action)
 with arm:
     said["before"] = arm.get_observation()
     refused(arm.send_action, {"shoulder_pan.pos": 0.0})

@@ -1,9 +1,10 @@
 """Make small policies of LeRobot, export them, and print how far their actions are from LeRobot's `select_action`.
 
 The arguments are a folder and the policies' names: a kind, ``act`` or ``diffusion``, a hyphen, and the coefficient of
-the ensemble in JSON. Each has a folder of its name.
+the ensemble in JSON. Each has a folder of its name. With ``-served`` LeRobot computes on a policy server.
 """
 
+import contextlib
 import json
 import sys
 from pathlib import Path
@@ -19,8 +20,14 @@ from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 from lerobot.policies.diffusion.processor_diffusion import make_diffusion_pre_post_processors
 
+from bam_envs.remote.serve.serve_options import ServeOptions
+from bam_envs.remote.serve.served_environment import ServedEnvironment
+from bam_train.checkpoint import POLICY, Checkpoint
 from bam_train.cli.export import main
+from bam_train.compat.foreign_export import served_policy
 from bam_train.policy import FrozenPolicy
+from bam_train.policy.policy_link import PolicyLink
+from bam_train.policy.policy_server import ServedPolicy
 
 NAMES = ["gripper.pos", "wrist_roll.pos", "wrist_flex.pos", "elbow_flex.pos", "shoulder_lift.pos", "shoulder_pan.pos"]
 IMAGE, STATE = "observation.images.front", "observation.state"
@@ -53,7 +60,8 @@ def make(kind, ensemble, rng):
     return DiffusionPolicy(config).eval(), *make_diffusion_pre_post_processors(config, stats)
 
 
-def export(folder, kind, parts):
+@contextlib.contextmanager
+def exported(folder, kind, parts, served):
     """Save the parts as LeRobot does, with a data set's features, and run `bam-export`; the frozen policy."""
     for part in parts:
         part.save_pretrained(folder / "pretrained_model")
@@ -67,22 +75,28 @@ def export(folder, kind, parts):
     (folder / "data" / "meta" / "info.json").write_text(json.dumps({"fps": 20, "features": features}))
     try:
         places = ["--data", str(folder / "data"), "--out", str(folder / "act.zip")]
-        main([f"lerobot:{folder / 'pretrained_model'}", *places, *FLAGS])
+        main([f"lerobot:{folder / 'pretrained_model'}", *places, *FLAGS, *["--served"] * served])
     except SystemExit as done:
         if done.code:
             raise
     saved.write_text(config_text)
-    return FrozenPolicy.load(folder / "act.zip")
+    checkpoint = Checkpoint.open(folder / "act.zip")
+    assert checkpoint.has(POLICY) != served
+    if not served:
+        yield FrozenPolicy.from_checkpoint(checkpoint)
+        return
+    with ServedEnvironment(ServedPolicy(served_policy(checkpoint)), ServeOptions(port=0, fast=True)) as there:
+        yield FrozenPolicy.from_checkpoint(checkpoint, PolicyLink(there.bus.url))
 
 
 def farthest(name, folder):
     """The greatest difference of an action in 100 frames, as a share of it."""
-    kind, _, ensemble = name.partition("-")
+    kind, ensemble, *served = name.split("-")
     rng, worst = np.random.default_rng(0), 0.0
     policy, pre, post = make(kind, json.loads(ensemble), rng)
     noise = torch.randn(1, 8, 6, generator=torch.Generator().manual_seed(0))
-    frozen = export(folder / name, kind, (policy, pre, post))
-    scale = np.array([0.05 / 100, *[np.pi / 180] * 5])
+    scale, stack = np.array([0.05 / 100, *[np.pi / 180] * 5]), contextlib.ExitStack()
+    frozen = stack.enter_context(exported(folder / name, kind, (policy, pre, post), bool(served)))
     for _ in range(100):
         theirs, seen = rng.normal(0, 20, 6).astype(np.float32), rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
         frame = {STATE: torch.tensor(theirs), IMAGE: torch.tensor(seen).permute(2, 0, 1).float() / 255}
@@ -90,6 +104,7 @@ def farthest(name, folder):
         expected = post(chosen)[0].numpy().astype(np.float64) * scale
         found = frozen.act({"robot": (theirs * scale)[::-1].astype(np.float32), "front": seen})[::-1]
         worst = max(worst, float(np.abs(found - expected).max() / np.abs(expected).max()))
+    stack.close()
     return worst
 
 

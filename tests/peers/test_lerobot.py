@@ -68,7 +68,7 @@ def read(root, tmp_path):
     return lerobot_python(tmp_path, READER, root, "0.05", tmp_path / "cache")
 
 
-POLICIES = ("act-null", "act-0.1", "diffusion-null")
+POLICIES = ("act-null", "act-0.1", "diffusion-null", "act-null-served")
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ knows which of them exclude each other; what a location cannot have is no field 
 
 import ipaddress
 import os
+import re
 import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,6 +21,7 @@ from bam_envs.core.validation import Positive, RobotName, check
 SIMULATED: Mapping[str, Any] = {"randomize": False, "link": None, "action_delay": None}
 """Arguments of an environment that only a simulated robot has, with their values for an ideal one."""
 
+_PLACEHOLDERS = re.compile(r"\b(?:HOST|PORT|ADDRESS|URL)\b")
 WHERE = ("robot", "transport", "profile", "guards", "trial", "shadow", "robot_name", "ca_file", "token_file")
 """Arguments of an environment that determine where it runs, and how far a live robot may go there; only a person gives
 them, never a file."""
@@ -41,6 +43,13 @@ def is_loopback(host: str) -> bool:
 def is_one_robot(url: str, identity: str) -> bool:
     """Whether `identity`, or the address if it is empty, belongs to one robot: every tunnel ends on this computer."""
     return bool(identity) or not is_loopback(urlsplit(url).hostname or "")
+
+
+def require_real(address: str) -> None:
+    """`InvalidValue` for an address that has a word of an example in it, such as HOST or PORT."""
+    if words := list(dict.fromkeys(_PLACEHOLDERS.findall(address))):
+        stand = f"{' and '.join(words)} stand{'s' if len(words) == 1 else ''}"
+        raise InvalidValue(f"{address!r}: {stand} for what yours is, such as 10.0.0.5:9090 in ws://10.0.0.5:9090.")
 
 
 def serving(env_id: str, robot_model: object = None) -> str:

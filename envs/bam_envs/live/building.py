@@ -6,7 +6,7 @@ from typing import Any
 
 from bam_envs.arms.description import ArmDescription, robot_model
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.location import NO_CREDENTIALS, LiveRobot
+from bam_envs.core.location import NO_CREDENTIALS, LiveRobot, require_real
 from bam_envs.core.robot import RobotSpec
 from bam_envs.core.robot_models import DEFAULT_ARM, known_models
 from bam_envs.live.rosbridge_robot import RosbridgeRobot
@@ -108,6 +108,7 @@ def require_effect(robot: SafeRobot, limits: Iterable[str]) -> None:
 
 def require_robot_address(url: str) -> None:
     """Check the form of a live robot's address; `InvalidValue` names the expected form."""
+    require_real(url)
     scheme, separator, rest = url.partition("://")
     if separator and scheme in ("ws", "wss"):
         return

@@ -112,6 +112,8 @@ class Inspection:
     """Round trip of each ping, in order [s]; NaN for a lost ping; empty if the server echoes none. Shape: (pings,)."""
     copies: int = 0
     """Number of echoes that arrived more than once."""
+    namespace: str = ""
+    """Prefix of its topics on the server, such as /bam_001."""
 
     @cached_property
     def readings(self) -> Mapping[str, Reading]:
@@ -259,7 +261,7 @@ def inspect_robot(
     mine = [one.message for one in letters.get(source.topic, ()) if concerns(source, one.message)] if source else []
     proof = needed_proof(link, info, narrowed, sinks, endpoint, identity, mine[-1] if mine else None)
     facts = letters, seconds, ahead, link.clock_offset, proof, identity
-    return Inspection(profile, info, (*required, *extra), sinks, types, *facts, **measured)
+    return Inspection(profile, info, (*required, *extra), sinks, types, *facts, **measured, namespace=link.namespace)
 
 
 def _types(

@@ -91,7 +91,7 @@ def _unreadable(inspection: Inspection, readings: Sequence[Reading]) -> str:
     topic, expected = readings[0].source.topic, readings[0].source.type
     kind = expected if inspection.types is None else inspection.types[topic]
     if not kind:
-        return "nobody publishes it"
+        return f"nobody publishes {inspection.namespace}{topic}" if inspection.namespace else "nobody publishes it"
     if not same_type(kind, expected):
         return bare_type(kind)
     for reading in readings:

@@ -174,7 +174,7 @@ def namespaces_with(link: Any, kind: Literal["topics", "services"], name: str, w
     spaces = [one.removesuffix(name) for one in found]
     whole = [space for space in spaces if {f"{space}{other}" for other in with_it} <= names]
     if whole:
-        return f" It is there at another address: {listed(f'ws://HOST:PORT{space}' for space in whole)}."
+        return f" It is there at another address: {listed(f'{link.url}{space}' for space in whole)}."
     own = [one.removeprefix(link.namespace) for one in found if one.startswith(f"{link.namespace}/")]
     if not own:
         return ""

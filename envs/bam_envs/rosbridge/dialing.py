@@ -75,7 +75,8 @@ def no_connection(
     if isinstance(error, TimeoutError | asyncio.TimeoutError):
         return f"no connection within {timeout:.1f} s. Is the address right, is the machine on, is a firewall between?"
     if isinstance(error, socket.gaierror):
-        return f"the name {address.host!r} is not known: {error.strerror}. Try the IP address."
+        example = " In examples it stands for the robot's computer." if address.host in ("robot", "gpu") else ""
+        return f"the name {address.host!r} is not known: {error.strerror}. Try the IP address.{example}"
     if isinstance(error, ConnectionRefusedError):
         here = f"Start one with `{stand_in} --port {address.port}` or `{_LAUNCH}`."
         if address.port == AGENT_PORT:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from bam_envs.core.errors import InvalidValue
-from bam_envs.core.location import NO_CREDENTIALS, Credentials, LiveRobot
+from bam_envs.core.location import NO_CREDENTIALS, Credentials, LiveRobot, require_real
 from bam_envs.core.validation import RobotName, check
 from bam_envs.rosbridge.tokens import read_token
 
@@ -55,6 +55,7 @@ class Endpoint:
     """See `LiveRobot`."""
 
     def __post_init__(self) -> None:
+        require_real(self.url)
         if self.token is None and self.credentials.token_file is not None:
             object.__setattr__(self, "token", read_token(self.credentials.token_file))
         if self.url.startswith(("ws://", "wss://")):

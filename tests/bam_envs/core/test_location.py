@@ -2,8 +2,11 @@
 
 import pytest
 
+from bam_envs.core.errors import InvalidValue
 from bam_envs.core.location import HERE, Credentials, LiveRobot, Remote, addresses, location_of
 from bam_envs.core.wording import as_flag
+from bam_envs.live.building import live_robot
+from bam_envs.remote.remote_env import open_transport
 from bam_train.deploy.guard_table import read_guards
 from bam_train.environments import with_live_robot
 from bam_train.errors import SettingsError
@@ -138,6 +141,21 @@ def test_a_guard_that_is_refused(texts, message):
     with pytest.raises(SettingsError) as caught:
         read_guards(texts)
     assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: live_robot("ws://HOST:PORT"), "'ws://HOST:PORT': HOST and PORT stand"),
+        (lambda: live_robot("URL"), "'URL': URL stands"),
+        (lambda: open_transport("ws://ADDRESS:9090/bam_001"), "'ws://ADDRESS:9090/bam_001': ADDRESS stands"),
+        (lambda: open_transport("tcp://HOST:9091"), "'tcp://HOST:9091': HOST stands"),
+    ],
+)
+def test_an_address_of_an_example_is_named(make, words):
+    with pytest.raises(InvalidValue) as caught:
+        make()
+    assert str(caught.value) == f"{words} for what yours is, such as 10.0.0.5:9090 in ws://10.0.0.5:9090."
 
 
 def test_an_environment_without_a_robot_says_so():

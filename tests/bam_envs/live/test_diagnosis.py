@@ -187,7 +187,7 @@ def test_a_robot_in_another_namespace(server, robot_on):
     robot_on(server, namespace="/cell_1")
     name, why = failure(diagnose(server.url, profile="ur5e")[1])
     assert name == "topics"
-    assert why.endswith(" It is there at another address: ws://HOST:PORT/cell_1.")
+    assert why.endswith(f" It is there at another address: {server.url}/cell_1.")
 
 
 @pytest.mark.parametrize("namespace", ["", "/cell_1"])
@@ -209,7 +209,7 @@ def test_the_profile_is_found_in_another_namespace(server, robot_on):
     robot_on(server, "mir100", namespace="/cell_1")
     diagnosis, steps = diagnose(server.url)
     assert diagnosis.profile.name == "mir100"
-    assert failure(steps)[1].endswith(" It is there at another address: ws://HOST:PORT/cell_1.")
+    assert failure(steps)[1].endswith(f" It is there at another address: {server.url}/cell_1.")
 
 
 def test_a_silent_topic(server, robot_on, patient):

@@ -13,6 +13,7 @@ from bam_envs.remote.rosbridge_transport import RosbridgeTransport
 from bam_envs.remote.serve.env_server import EnvServer
 from bam_envs.remote.serve.gymapi_service import GymApiService
 from bam_envs.remote.wire.transport import Transport
+from bam_envs.ros.codec import INFO_SERVICE, RobotInfo
 from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.server import BridgeServer
 from bam_envs.testing import TransportContract
@@ -151,12 +152,24 @@ def test_an_environment_that_is_not_there(served, open_to, channel):
     assert open_to(env_id="Pick", channel=channel).connect().env_id == "bam/pick-v0"
 
 
-def test_nothing_is_served_in_that_namespace(served, open_to):
+@pytest.mark.parametrize(
+    ("agent", "text"),
+    [(True, "a live agent, and the robot ur5e are there"), (False, "a robot is there")],
+)
+def test_a_robot_without_an_environment_is_named(server, open_to, agent, text):
+    info = RobotInfo("ur5e", agent=agent).to_json()
+    server.serve(f"/bam_002{INFO_SERVICE}", "std_srvs/Trigger", lambda *_: {"success": True, "message": info})
+    with pytest.raises(NoServer) as error:
+        open_to("bam_002").connect()
+    assert f": {text}, and no environment. --robot takes its address. Start one: bam-serve" in str(error.value)
+
+
+def test_nothing_is_served_in_that_namespace(server, served, open_to):
     served(MirrorEnv(spaces.Discrete(3)))
     with pytest.raises(NoServer) as error:
         open_to("bam_002").connect()
     assert "/bam_002/gym_env/gym_api_request does not exist. " in str(error.value)
-    assert "It is there at another address: ws://HOST:PORT/bam_001. Start one: bam-serve" in str(error.value)
+    assert f"It is there at another address: {server.url}/bam_001. Start one: bam-serve" in str(error.value)
     assert str(error.value).endswith("Start one: bam-serve --env bam/pick --namespace bam_002")
 
 

@@ -74,6 +74,11 @@ def test_a_name_that_nobody_knows():
     text = failure("ws://no-such-robot.invalid:9090")
     assert text.startswith("the name 'no-such-robot.invalid' is not known: ")
     assert text.endswith(". Try the IP address.")
+    error = socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+    assert no_connection(Address("robot", 9090, False, ""), error, 1.0) == (
+        "the name 'robot' is not known: Name or service not known. Try the IP address. "
+        "In examples it stands for the robot's computer."
+    )
 
 
 @pytest.mark.parametrize(

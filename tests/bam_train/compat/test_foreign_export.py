@@ -249,8 +249,10 @@ def test_a_graph_with_other_inputs_is_refused(described, run):
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"type": "smolvla"}, "smolvla takes seconds for a chunk on a robot's computer: run it on a policy server "
-         "with a GPU; bam-export takes act and diffusion"),
+        ({"type": "smolvla"}, "smolvla takes seconds for a chunk on a robot's computer. Add --served, on a computer "
+         "with a GPU, for a checkpoint that bam-serve --policy serves there with LeRobot"),
+        ({"type": "diffusion", "n_obs_steps": 2, "horizon": 16}, "diffusion has no chunks for a single observation, "
+         "and cannot be served; act and diffusion are exported without --served"),
         ({"type": "tdmpc"}, "is a policy of the kind tdmpc; bam-export takes act and diffusion"),
         ({}, "is a policy of the kind that config.json does not name (type); bam-export takes act and diffusion"),
         ({"type": "diffusion", "noise_scheduler_type": "DDPM"}, "noise_scheduler_type is DDPM, which draws noise in "
@@ -262,7 +264,8 @@ def test_a_folder_of_lerobot_that_cannot_be_exported(run, tmp_path, config, mess
     pytest.importorskip("torch")
     if config is not None:
         (tmp_path / "config.json").write_text(json.dumps(config))
-    assert run(main, f"lerobot:{tmp_path}") == (1, "", f"bam-export: {tmp_path}: {message}\n")
+    flags = ["--served"] if "served;" in message else []
+    assert run(main, f"lerobot:{tmp_path}", *flags) == (1, "", f"bam-export: {tmp_path}: {message}\n")
 
 
 def test_a_zip_of_stable_baselines3(run, tmp_path, capsys):

@@ -60,9 +60,13 @@ def test_it_must_act_as_the_checkpoint_does(served, tmp_path):
     golden["action"] = np.array([[101, 101.1, 101.2, 101.3]] * 2, np.float32)[..., None]
 
     def load(server):
-        members = {"bam/policy.onnx": b"not read", "bam/golden.safetensors": safetensors_file.dump(golden)}
+        members = {"bam/golden.safetensors": safetensors_file.dump(golden)}  # and no graph
         return FrozenPolicy.from_checkpoint(write_checkpoint(path, fields, members), server)
 
+    with pytest.raises(PolicyError) as error:
+        load(None)
+    where = "run bam-serve --policy there, and give its address: --policy-server"
+    assert str(error.value) == f"{path}: its own library computes its actions, where it was exported: {where}"
     with served(ServedPolicy(chunked(CHUNK))) as (url, _):
         assert acts(load(PolicyLink(url)), 1) == [101.0]
         golden["action"][1, 3] = 105
