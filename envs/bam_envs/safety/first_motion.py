@@ -26,8 +26,6 @@ SHORTEST = 4
 """Least time in which a command is to be reached before the arm has shown that it stays [periods]."""
 GAP, KNOWN_GAP = 1e4, 4 * math.pi
 """Greatest distance of a command from the measured joint [rad]: in any unit, and in one that was proved before."""
-LEAST_SHOWN = 0.1
-"""Least share of the motion of a joint that its measurement may show before its commands are proved."""
 STILL, SAG = 0.002, 0.03
 """Motion of a joint commanded to stay that counts as none, and the most that its load explains [rad]."""
 NEAR_ZERO = 2 * math.pi * math.pi / 180
@@ -104,7 +102,7 @@ class ProofMotion:
                 f"all joints are measured within {NEAR_ZERO:.2f} rad of 0, as by a driver or a profile that takes "
                 "radians for degrees, with which a motion would look like none: correct the scale, or jog a joint away"
             )
-        yield from self._stay(first=every)
+        yield from self._stay(GAP if every else KNOWN_GAP)
         yield from self._together() if every else self._ramp(self._all(TINY), self._rest, 0.0)
         there = self._rest
         for joint in range(len(self._labels)) if every else [len(self._labels) - 1]:
@@ -114,20 +112,17 @@ class ProofMotion:
     def _all(self, amount: float) -> Numbers:
         return [sign * amount for sign in self._signs]
 
-    def _stay(self, *, first: bool) -> Moves:
+    def _stay(self, greatest: float) -> Moves:
         """Stay at the measured position; a command that means another one is approached so slowly that it shows first.
 
         A gap between what is measured and what is commanded closes in the commanded time. The longer nothing moves, the
-        smaller is the gap that is still possible, and the shorter the commanded time. In a `first` proof a gap may be
-        in another unit, or, if it is of an arm's own size, one of which the measurement shows `LEAST_SHOWN`.
+        smaller is the gap that is still possible, and the shorter the commanded time.
         """
         goal = [at + way for at, way in zip(self._start, self._all(TINY), strict=True)]
         closed = [0.0]  # share of a gap that was closed after each command
         while self._is_timed:
             delay = 1 + self._ticks(self._lag + self.age)  # commands that may not show yet
-            unseen = STILL / max(closed[max(0, len(closed) - delay)], 1e-9)
-            own = min(KNOWN_GAP, self._sag + unseen / (LEAST_SHOWN if first else 1.0))
-            gap = max(own, min(GAP, self._sag + unseen)) if first else own
+            gap = min(greatest, self._sag + STILL / max(closed[max(0, len(closed) - delay)], 1e-9))
             if gap <= MOST:
                 break
             closed.append(closed[-1] + self._period * SLOW / gap)

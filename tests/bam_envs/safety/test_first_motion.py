@@ -182,7 +182,7 @@ class BusyArm(WiredArm):
 
 EACH = st.lists(st.sampled_from(UNITS), min_size=6, max_size=6)
 # A joint that is measured much smaller than it is shows no motion before it is large.
-SHOWN = st.lists(st.sampled_from([one for one in UNITS if abs(one) >= 0.2]), min_size=6, max_size=6)
+SHOWN = st.lists(st.sampled_from([one for one in UNITS if abs(one) >= 0.5]), min_size=6, max_size=6)
 BUSY = st.fixed_dictionaries(
     {
         "lag": st.sampled_from([0.0, 0.03, 0.1]),
@@ -312,11 +312,11 @@ def test_radians_that_are_taken_for_degrees_are_found_before_anything_moves():
     assert arm.now == 0.0
 
 
-@pytest.mark.parametrize(("known", "seconds"), [(False, 5.0), (True, 3.0)])
-def test_an_arm_that_ignores_everything_is_named_soon(known, seconds):
-    arm = WiredArm(stuck=range(6), known=known)
-    assert driven(arm)[1] is not None
-    assert arm.now <= seconds
+def test_an_arm_that_ignores_everything_is_named_within_three_seconds():
+    for known in (False, True):
+        arm = WiredArm(stuck=range(6), known=known)
+        assert driven(arm)[1] is not None
+        assert arm.now <= 3.0
 
 
 def test_positions_that_are_executed_at_once_are_not_sent_unproved():
@@ -341,20 +341,22 @@ def test_an_arm_that_sags_under_its_load_is_proved_where_its_limits_allow_for_it
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.sampled_from(["command", "state"]),
-    st.sampled_from([0.1, -0.1, 0.2, 0.5, 0.9, 2.0, 10.0, -10.0]),
+    st.sampled_from(
+        [("command", scale) for scale in (0.1, -0.1, 0.2, 0.5, 0.9, 2.0, 10.0, -10.0)]
+        + [("state", scale) for scale in (0.5, 0.9, 2.0, 10.0, -10.0)]
+    ),
     st.integers(0, 5),
     st.sampled_from([0.0, 0.1, 0.33, 1.0, -2.9]),
     BUSY,
 )
-def test_one_joint_that_is_measured_or_commanded_smaller_or_larger_than_it_is(side, scale, joint, at, busy):
+def test_one_joint_that_is_measured_or_commanded_smaller_or_larger_than_it_is(scaled, joint, at, busy):
+    side, scale = scaled
     scales, start = [1.0] * 6, np.array([0.0, -1.57, 1.57, 0.3, 1.57, 0.0])
     scales[joint], start[joint] = scale, at
-    slider, most = (1.0, 0.09) if side == "state" and abs(scale) < 0.2 else (busy["slider"], MOST)
-    arm = BusyArm(**{side: Wiring(scale=scales)}, start=start, **{**busy, "slider": slider})
+    arm = BusyArm(**{side: Wiring(scale=scales)}, start=start, **busy)
     _, why = driven(arm)
     assert why is not None or (scale, at) == (0.9, 0.0)
-    assert arm.farthest <= most
+    assert arm.farthest <= MOST
     assert arm.fastest <= FASTEST
 
 
