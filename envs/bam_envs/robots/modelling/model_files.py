@@ -259,7 +259,7 @@ def _check_names(path: Path, root: ElementTree.Element) -> None:
     for joint in root.findall("joint"):
         link, name = joint.find("child").get("link", ""), joint.get("name")  # type: ignore[union-attr]
         if (other := held.setdefault(link, name)) != name:
-            loop = "a closed loop, and only trees of links are read"
+            loop = "a closed loop, and only trees of links are read: take one of the two out"
             raise InvalidValue(f"{path}: the link {link!r} hangs on the joints {other} and {name}: {loop}.")
 
 
