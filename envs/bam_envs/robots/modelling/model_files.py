@@ -744,9 +744,8 @@ class _Reader:
         groups = _finger_groups(model, moved, cloud)
         if len(groups) == 1:  # one jaw moves against a fixed one
             fixed = [cloud(int(body)) for body in np.flatnonzero(bodies & ~moved)]
-            body = self._end
-            while not sum(map(len, fixed)) and body:
-                fixed, body = [cloud(body)], int(model.body_parentid[body])
+            if not sum(map(len, fixed)):  # the last link, with what is fixed to it
+                fixed = [cloud(int(body)) for body in np.flatnonzero(model.body_weldid == model.body_weldid[self._end])]
             groups.append(np.concatenate(fixed))
             jaw = int(np.flatnonzero(moved)[0])
             self._pivot = np.append(data.xanchor[model.body_jntadr[jaw]], 1.0)

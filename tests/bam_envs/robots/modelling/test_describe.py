@@ -596,6 +596,15 @@ def test_a_gripper_points_along_another_axis_of_the_end_where_z_is_across_the_ar
     assert np.linalg.det(read.tool[:3, :3]) == pytest.approx(1.0)
 
 
+def test_a_fixed_finger_may_be_a_body_of_its_own(tmp_path):
+    finger = '<geom type="box" size="0.006 0.01 0.04" pos="0.006 0 0.05" mass="0.02"/>'
+    (tmp_path / "five.xml").write_text(FIVE, encoding="utf-8")
+    (tmp_path / "two.xml").write_text(FIVE.replace(finger, f'<body name="stator">{finger}</body>'), encoding="utf-8")
+    one, other = (read_arm(str(tmp_path / name), None, "b5") for name in ("five.xml", "two.xml"))
+    assert one.width == other.width > 0.02
+    np.testing.assert_allclose(one.tool, other.tool, atol=1e-9)
+
+
 @pytest.mark.parametrize(("pan", "aside"), [("-1.9 1.9", 0.0), ("-3.1 3.1", -0.6)])
 def test_an_arm_that_faces_another_way_is_turned_to_face_x(described, tmp_path, pan, aside):
     """Also one that turns all round, if it works nowhere as it stands: 0.6 m behind the origin, and then beside it."""
