@@ -117,13 +117,13 @@ def _span(chain: SerialChain) -> tuple[float, float]:
 
 
 def _boxes(chain: SerialChain, scale: float) -> Iterator[Array]:
-    """Boxes of one size at growing distances from the base."""
+    """Boxes of one size before the first joint, at growing distances from the base."""
     (span, up), whole = _span(chain), np.concatenate([chain.placements[:, :3, 3], chain.tool_placement[None, :3, 3]])
     length = float(np.linalg.norm(whole, axis=1).sum())
     nearest = 0.5 * (BOX[1, 0] - BOX[0, 0]) * scale + 0.08
     for middle, height in itertools.product(np.arange(nearest, length, max(0.02, 0.05 * length)), _HEIGHTS):
         box = BOX * scale
-        box[:, 0] += round(float(middle), 3)
+        box[:, :2] += np.round([middle, chain.placements[0, 1, 3]], 3)
         box[:, 2] = BOX[0, 2], max(0.06, height * box[1, 2])
         corners = np.array(list(itertools.product(*box.T))) + (np.array([0.0, 0.0, up]) - chain.placements[0, :3, 3])
         if box[1, 0] <= TABLE_END and np.linalg.norm(corners, axis=1).max() < span:
@@ -131,7 +131,8 @@ def _boxes(chain: SerialChain, scale: float) -> Iterator[Array]:
 
 
 def _middle(box: Array) -> Array:
-    return np.array([box[:, 0].mean(), 0.0, box[0, 2] + 0.55 * (box[1, 2] - box[0, 2])])
+    x, y = box[:, :2].mean(axis=0)
+    return np.array([x, y, box[0, 2] + 0.55 * (box[1, 2] - box[0, 2])])
 
 
 def _homes(chain: SerialChain, outline: Outline, box: Array) -> list[tuple[float, Array]]:

@@ -82,24 +82,15 @@ def describe(
     if read.shapes is not None:
         tell(f"comparing capsules with the shapes of the links, in {_POSTURES} postures")
     arm, how_well = _outlined(first, read)
-    mount, quarters = first.mount, _facing(first)
-    if quarters:
-        turn = np.pi / 4 * quarters
-        mount = Placed(quat=(float(np.cos(turn)), 0.0, 0.0, float(np.sin(turn))))
-        read.notes.append(
-            f"the base is turned by {90 * quarters} degrees about z, to face x (mount), as poses of a live robot are"
-        )
-    arm = dataclasses.replace(arm, mount=mount)
     try:
-        found = find_work_area(arm, _turned(arm), tell=tell)
+        found = _with_area(arm, read.notes, tell)
     except InvalidValue:
         if read.shapes is None:
             raise
         # Capsules are thicker than a bent link: what the slightest of its collisions are is given up.
         read.shapes.trust_pads()
         arm, how_well = _outlined(first, read, _GIVEN_UP)
-        arm = dataclasses.replace(arm, mount=mount)
-        found = find_work_area(arm, _turned(arm), tell=tell)
+        found = _with_area(arm, read.notes, tell)
         read.notes.append(
             f"collisions of the arm with itself: the slightest {_GIVEN_UP:.0%} of two links are not noticed"
         )
@@ -111,13 +102,29 @@ def describe(
     return found, read.notes
 
 
-def _facing(arm: ArmDescription) -> int:
+def _with_area(arm: ArmDescription, notes: list[str], tell: Callable[[str], None]) -> ArmDescription:
+    """The arm with its work area, its base turned to face x if it works in few directions, or in none as it stands."""
+    facing = _facing(arm.chain)
+    if arm.chain.high[0] - arm.chain.low[0] > _ANYWHERE:
+        try:
+            return find_work_area(arm, _turned(arm), tell=tell)
+        except InvalidValue:
+            if not facing:
+                raise
+    turn = np.pi / 4 * facing
+    placed = dataclasses.replace(arm, mount=Placed(quat=(float(np.cos(turn)), 0.0, 0.0, float(np.sin(turn)))))
+    found = find_work_area(placed, _turned(placed), tell=tell)
+    if facing:
+        notes.append(
+            f"the base is turned by {90 * facing} degrees about z, to face x (mount), as poses of a live robot are"
+        )
+    return found
+
+
+def _facing(chain: SerialChain) -> int:
     """Quarter turns about z of the base after which the arm is before x with its first joint in mid-travel."""
-    chain = arm.chain
-    if chain.high[0] - chain.low[0] > _ANYWHERE:
-        return 0
     low, high = np.maximum(chain.low, -np.pi), np.minimum(chain.high, np.pi)
-    q = low + np.random.default_rng(0).random((1000, arm.num_joints)) * (high - low)
+    q = low + np.random.default_rng(0).random((1000, chain.num_joints)) * (high - low)
     q[:, 0] = 0.5 * (chain.low[0] + chain.high[0])
     x, y, _ = (chain.tool_position(q) - chain.placements[0, :3, 3]).mean(axis=0)
     return round(-float(np.arctan2(y, x)) / (np.pi / 2)) if np.hypot(x, y) > _ASIDE else 0
@@ -228,10 +235,11 @@ def _slack(arm: ArmDescription, q: Array, apart: Apart, given_up: float) -> Iter
     for one, other in sorted({(int(i), int(j)) for i, j in links} & apart.keys()):
         gap = gaps[:, (links == [one, other]).all(axis=1)].min(axis=1)
         acts, known = gap < _CLEARANCE, (one, other) in guarded
-        few = (apart[one, other] < -_TOUCH).sum() < _MANY
-        touching = np.sort(gap[acts & (apart[one, other] < (0.0 if few else -_TOUCH))])[::-1]  # the slightest first
-        if not len(touching) and not known:
+        touches = int((apart[one, other] < -_TOUCH).sum())
+        if not touches and not known:
             continue  # limits of joints keep these links apart
+        few = touches < _MANY
+        touching = np.sort(gap[acts & (apart[one, other] < (0.0 if few else -_TOUCH))])[::-1]  # the slightest first
         slack = 0.0
         if (acts & (apart[one, other] > _CLEARANCE)).mean() > _RARE * (1 + few):
             least = touching[int(given_up * len(touching))] if len(touching) else gap.min()

@@ -259,7 +259,7 @@ def _check_names(path: Path, root: ElementTree.Element) -> None:
     for joint in root.findall("joint"):
         link, name = joint.find("child").get("link", ""), joint.get("name")  # type: ignore[union-attr]
         if (other := held.setdefault(link, name)) != name:
-            loop = "a closed loop, and only trees of links are read"
+            loop = "a closed loop, and only trees of links are read: take one of the two out"
             raise InvalidValue(f"{path}: the link {link!r} hangs on the joints {other} and {name}: {loop}.")
 
 
@@ -744,9 +744,8 @@ class _Reader:
         groups = _finger_groups(model, moved, cloud)
         if len(groups) == 1:  # one jaw moves against a fixed one
             fixed = [cloud(int(body)) for body in np.flatnonzero(bodies & ~moved)]
-            body = self._end
-            while not sum(map(len, fixed)) and body:
-                fixed, body = [cloud(body)], int(model.body_parentid[body])
+            if not sum(map(len, fixed)):  # the last link, with what is fixed to it
+                fixed = [cloud(int(body)) for body in np.flatnonzero(model.body_weldid == model.body_weldid[self._end])]
             groups.append(np.concatenate(fixed))
             jaw = int(np.flatnonzero(moved)[0])
             self._pivot = np.append(data.xanchor[model.body_jntadr[jaw]], 1.0)

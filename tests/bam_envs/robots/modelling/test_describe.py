@@ -348,7 +348,8 @@ def scaled(text, factor):
             six_joints().replace('<link name="tool0"/>', '<link name="tool0"/>' + LOOP),
             GRIPPER,
             None,
-            "{}: the link 'fore' hangs on the joints elbow and rod: a closed loop, and only trees of links are read.",
+            "{}: the link 'fore' hangs on the joints elbow and rod: a closed loop, and only trees of links are read: "
+            "take one of the two out.",
         ),
         (six_joints(), GRIPPER, "tol0", "Unknown link 'tol0'. Did you mean 'tool0'?"),
         (
@@ -595,16 +596,29 @@ def test_a_gripper_points_along_another_axis_of_the_end_where_z_is_across_the_ar
     assert np.linalg.det(read.tool[:3, :3]) == pytest.approx(1.0)
 
 
-def test_an_arm_that_faces_another_way_is_turned_to_face_x(described, tmp_path):
-    text = FIVE.replace('name="base"', 'name="base" quat="1 0 0 -1"')
-    (tmp_path / "five.xml").write_text(text, encoding="utf-8")
+def test_a_fixed_finger_may_be_a_body_of_its_own(tmp_path):
+    finger = '<geom type="box" size="0.006 0.01 0.04" pos="0.006 0 0.05" mass="0.02"/>'
+    (tmp_path / "five.xml").write_text(FIVE, encoding="utf-8")
+    (tmp_path / "two.xml").write_text(FIVE.replace(finger, f'<body name="stator">{finger}</body>'), encoding="utf-8")
+    one, other = (read_arm(str(tmp_path / name), None, "b5") for name in ("five.xml", "two.xml"))
+    assert one.width == other.width > 0.02
+    np.testing.assert_allclose(one.tool, other.tool, atol=1e-9)
+
+
+@pytest.mark.parametrize(("pan", "aside"), [("-1.9 1.9", 0.0), ("-3.1 3.1", -0.6)])
+def test_an_arm_that_faces_another_way_is_turned_to_face_x(described, tmp_path, pan, aside):
+    """Also one that turns all round, if it works nowhere as it stands: 0.6 m behind the origin, and then beside it."""
+    text = FIVE.replace('name="base"', 'name="base" quat="1 0 0 -1"').replace("-1.9 1.9", pan, 1)
+    (tmp_path / "five.xml").write_text(text.replace('"0 0 0.07"', f'"0 {aside} 0.07"'), encoding="utf-8")
     arm, notes = describe("five", str(tmp_path / "five.xml"), None, "b5")
     turned = "the base is turned by 90 degrees about z, to face x (mount), as poses of a live robot are"
     assert notes[-1] == turned
     straight, _ = described["five"]
-    assert (arm.workspace, arm.joint_names) == (straight.workspace, straight.joint_names)
+    beside = np.array([0.0, aside, 0.0])
+    np.testing.assert_allclose(arm.workspace, np.array(straight.workspace) + beside, atol=1e-9)
+    assert arm.joint_names == straight.joint_names
     np.testing.assert_allclose(
-        arm.chain.tool_position(np.zeros((1, 5))), straight.chain.tool_position(np.zeros((1, 5))), atol=1e-9
+        arm.chain.tool_position(np.zeros((1, 5))), straight.chain.tool_position(np.zeros((1, 5))) + beside, atol=1e-9
     )
 
 
