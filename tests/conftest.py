@@ -14,6 +14,8 @@ import sys
 import time
 from typing import Any
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy and torch read it: more threads than cores wait busily
+
 import numpy as np
 import pytest
 from hypothesis import settings

@@ -1,7 +1,8 @@
-"""Plays a checkpoint's frozen policy in robo-gym's own environment class and in ours, and prints how each episode went.
+"""Plays checkpoints' frozen policies in robo-gym's own environment classes and in ours; prints how each episode went.
 
 robo-gym's class speaks gRPC to a robot server on loopback, as it does with Gazebo; behind this one is our simulation.
-Run by `test_robo_gym.py` where robo-gym is installed: python tests/peers/robo_gym_policy.py CHECKPOINT ID EPISODES
+Run by `test_robo_gym.py` where robo-gym is installed: python -m tests.peers.robo_gym_policy FOLDER EPISODES ID...
+The checkpoint of an id is in the folder, under the name of the id.
 """
 
 import json
@@ -92,22 +93,23 @@ def play(env, policy, observation):
     return {"return": total, "steps": steps, "status": info["final_status"]}
 
 
-def main():
-    path, env_id, episodes = sys.argv[1], sys.argv[2], int(sys.argv[3])
+def played(path, env_id, episodes):
+    """How each episode went there and here."""
     policy = FrozenPolicy.load(path)
     ours = gym.make(env_id, parity=True, disable_env_checker=True)
     server = grpc.server(ThreadPoolExecutor(1))
     services.add_RobotServerServicer_to_server(BaseServer() if "Mir100" in env_id else ArmServer(), server)
     port = server.add_insecure_port("127.0.0.1:0")
     server.start()
-    theirs = make_theirs(env_id.removesuffix("Sim-v0"), Client(f"127.0.0.1:{port}"))
+    theirs, found = make_theirs(env_id.removesuffix("Sim-v0"), Client(f"127.0.0.1:{port}")), []
     for seed in range(episodes):
         observation, _ = ours.reset(seed=seed)
         expected, _ = theirs.reset(options=same_start(ours))
-        found = {"ours": play(ours, policy, observation), "theirs": play(theirs, policy, expected)}
-        print(json.dumps(found), flush=True)
+        found.append({"ours": play(ours, policy, observation), "theirs": play(theirs, policy, expected)})
     server.stop(None).wait()
+    return found
 
 
 if __name__ == "__main__":
-    main()
+    folder, number, *ids = sys.argv[1:]
+    print(json.dumps({env_id: played(f"{folder}/{env_id}.zip", env_id, int(number)) for env_id in ids}))

@@ -3,8 +3,10 @@ not ours and as a ROS 2 node; and the policy of a checkpoint ends them with the 
 
 import contextlib
 import json
+import os
 import re
 import runpy
+import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -14,6 +16,7 @@ import pytest
 import bam_envs  # noqa: F401 - registers the environments
 from bam_envs.remote.remote_env import RemoteEnv, open_transport
 from bam_envs.remote.serve.env_server import LocalTransport
+from tests.peers.conftest import Peer
 
 HERE = Path(__file__).parent
 play = runpy.run_path(str(HERE / "play.py"))["play"]
@@ -80,10 +83,17 @@ def test_tcp_and_embedded_rosbridge(served, here):
     assert played(rosbridge, channel="topics") == here
 
 
+@pytest.fixture(scope="module")
+def via(rosbridge, running_robot):
+    """The address of `bam-serve` behind the server that is not ours."""
+    program = Peer([sys.executable, *SERVE, "--via", rosbridge.url, "--namespace", "via"], dict(os.environ))
+    with contextlib.closing(program):
+        yield address(program.line("bam-serve: bam/pick-v0 on "))
+
+
 @pytest.mark.parametrize("channel", ["service", "topics"])
-def test_through_the_other_server(channel, served, rosbridge, running_robot, here):
-    served("--via", rosbridge.url, "--namespace", f"via_{channel}")
-    closely(played(f"{rosbridge.url}/via_{channel}", channel=channel), here, 1e-6)
+def test_through_the_other_server(channel, via, rosbridge, here):
+    closely(played(f"{rosbridge.url}/via", channel=channel), here, 1e-6)
 
 
 LEAVES = """
@@ -96,12 +106,12 @@ SUCCESS, FAILURE = {"value": 1}, {"value": 2}
 
 
 @pytest.mark.parametrize("way", ["embedded", "via"])
-def test_a_foreign_client_steps_it(way, served, rosbridge, running_robot, roslibjs):
+def test_a_foreign_client_steps_it(way, request, served, roslibjs):
     """One that knows the service and its fields, and nothing of ours."""
-    flags = ("--port", "0") if way == "embedded" else ("--via", rosbridge.url)
-    url = address(served("--namespace", f"rack_{way}", *flags)[0])
+    embedded = way == "embedded"
+    url = address(served("--namespace", way, "--port", "0")[0]) if embedded else request.getfixturevalue("via")
     action = [0.5, -0.25, 0.125, 0.0, 1.0]
-    answers = roslibjs("gym_client.mjs", url, f"/rack_{way}/gym_env/gym_api_request", "5", json.dumps(action))
+    answers = roslibjs("gym_client.mjs", url, f"/{way}/gym_env/gym_api_request", "5", json.dumps(action))
     with contextlib.closing(gym.make("bam/pick-v0")) as env:
         first, _ = env.reset(seed=5)
         second, reward, *_ = env.step(np.float32(action))

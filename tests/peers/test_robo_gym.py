@@ -40,19 +40,27 @@ def test_parity(request):
     assert "skipped" not in output, output
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("env_id", ["NoObstacleNavigationMir100Sim-v0", "EndEffectorPositioningURSim-v0"])
-def test_a_policy_of_ours_in_robo_gym(env_id, request, tmp_path):
-    """A checkpoint that was trained with parity=True does there what it does here."""
+IDS = ("NoObstacleNavigationMir100Sim-v0", "EndEffectorPositioningURSim-v0")
+
+
+@pytest.fixture(scope="module")
+def played(pytestconfig, tmp_path_factory):
+    """Two episodes of each id with a checkpoint that was trained with parity=True, there and here."""
     pytest.importorskip("stable_baselines3")
-    root, path = request.config.rootpath, tmp_path / "policy.zip"
+    folder = tmp_path_factory.mktemp("policies")
     small = ("n_steps=64", "batch_size=64", "n_epochs=1", "num_envs=2", "env_kwargs.parity=true")
-    settings = {"env": env_id, "algo": "ppo", "steps": 256, "eval_episodes": 1, "set": small}
-    train(TrainConfig(**settings, out=path, runs=tmp_path / "runs"))
-    program = ["-m", "tests.peers.robo_gym_policy", path, env_id, "2"]
-    episodes = [json.loads(line) for line in run(PYTHON, *program, root=root).splitlines()]
-    assert len(episodes) == 2
-    for episode in episodes:
+    for env_id in IDS:
+        settings = {"env": env_id, "algo": "ppo", "steps": 256, "eval_episodes": 1, "set": small}
+        train(TrainConfig(**settings, out=folder / f"{env_id}.zip", runs=folder / "runs"))
+    return json.loads(run(PYTHON, "-m", "tests.peers.robo_gym_policy", folder, 2, *IDS, root=pytestconfig.rootpath))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", IDS)
+def test_a_policy_of_ours_in_robo_gym(env_id, played):
+    """A checkpoint does there what it does here."""
+    assert len(played[env_id]) == 2
+    for episode in played[env_id]:
         ours, theirs = episode["ours"], episode["theirs"]
         assert (ours["status"], ours["steps"]) == (theirs["status"], theirs["steps"])
         assert ours["return"] == pytest.approx(theirs["return"], abs=1e-2)  # wire states are float32

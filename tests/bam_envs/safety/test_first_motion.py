@@ -40,15 +40,38 @@ class Wiring:
         return numbers[self.order] * self.scale + self.offset
 
 
-class WiredArm:
-    """A live arm in simulated time, which turns its joints at up to 3.14 rad/s to where its wiring sends them.
-
-    With `timed`, it goes to a command in the time that the command says, else at once; `lag` [s] later.
-    """
+class Timed:
+    """A live robot in simulated time, which begins where it is."""
 
     needs_clearance = True
     num_robots = 1
     info = None
+
+    def clock(self):
+        return self.now
+
+    def connect(self):
+        pass
+
+    def reset(self, env_ids, initial):
+        return self.measure()
+
+    def age(self):
+        return 0.0
+
+    def halt(self):
+        pass
+
+    def close(self):
+        pass
+
+
+class WiredArm(Timed):
+    """An arm, which turns its joints at up to 3.14 rad/s to where its wiring sends them.
+
+    With `timed`, it goes to a command in the time that the command says, else at once; `lag` [s] later.
+    """
+
     slider = 1.0
     """Share of its speed that is left, of a driver that does not report it."""
     speed_scale, width_of, joints_only = 1.0, staticmethod(lambda width: width), False
@@ -78,24 +101,6 @@ class WiredArm:
         self.farthest = self.fastest = 0.0
         self.speed, self.trace = np.zeros(6), [self.joints]
         self.sent = np.full((1, 7), np.nan)
-
-    def clock(self):
-        return self.now
-
-    def connect(self):
-        pass
-
-    def reset(self, env_ids, initial):
-        return self.measure()
-
-    def age(self):
-        return 0.0
-
-    def halt(self):
-        pass
-
-    def close(self):
-        pass
 
     def tell_proved(self, lag):
         self.proof.done(lag)
@@ -526,12 +531,9 @@ def test_a_gripper_that_is_measured_inverted_or_as_an_angle_is_found(width_of):
     assert "gripper_width was commanded to open to 0.085 m and is measured at 0.000 m: inverted" in why
 
 
-class Base:
-    """A base in simulated time that gains `gain` [m/s^2, rad/s^2] of speed at most."""
+class Base(Timed):
+    """A base that gains `gain` [m/s^2, rad/s^2] of speed at most."""
 
-    needs_clearance = True
-    num_robots = 1
-    info = None
     spec = base_model("mir100").spec()
 
     def __init__(self, gain=2.5, pose_scale=1.0, turn_scale=1.0):
@@ -540,24 +542,6 @@ class Base:
         self.spec = replace(
             self.spec, signals=tuple(one for one in self.spec.signals if "scan" not in one.name), body=None
         )
-
-    def clock(self):
-        return self.now
-
-    def connect(self):
-        pass
-
-    def reset(self, env_ids, initial):
-        return self.measure()
-
-    def age(self):
-        return 0.0
-
-    def halt(self):
-        pass
-
-    def close(self):
-        pass
 
     def measure(self):
         pose = self.pose * (self.pose_scale, self.pose_scale, 1.0)
