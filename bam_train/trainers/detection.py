@@ -54,8 +54,8 @@ def add_own_detector(
 ) -> Detector:
     """As `add_detector`, of about `steps` steps of the checkpoint's own policy in new episodes of its environment.
 
-    If that has simulated robots, these are as live ones in half of the steps; see `LiveLike`. Episodes that the policy
-    has `played` already, with the parts of `parts_of`, take the place of new ones.
+    If that has simulated robots, these are as live ones in half of the steps, of fewer than `WANTED` in a third; see
+    `LiveLike`. Episodes that the policy has `played` already, with the parts of `parts_of`, take the place of new ones.
 
     Raises:
         SettingsError: Too few steps, or the observations are not up to `MOST_NUMBERS` numbers.
@@ -81,7 +81,8 @@ def add_own_detector(
         if not is_robot:
             return add_detector(path, plain)
         inner.robot = LiveLike(inner.robot)
-        return add_detector(path, plain, fresh_episodes(rows, env, policy, steps // 2, SEED + steps), limit=limit)
+        live = steps // (4 if steps < WANTED else 2)  # the slow ones are long, and would take a tenth of a short run
+        return add_detector(path, plain, fresh_episodes(rows, env, policy, live, SEED + steps), limit=limit)
 
 
 def parts_of(envs: VectorEnv[Any, Any, Any]) -> Parts | None:

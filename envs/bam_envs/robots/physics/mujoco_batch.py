@@ -7,6 +7,7 @@ an environment in a batch equals the same one alone, bit for bit.
 
 import copy
 import importlib
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,7 @@ class Physics:
         """Create the threads and their working memory, which belong to this process."""
         self._data = [mujoco.MjData(self.model) for _ in range(self._threads)]
         self._scratch = mujoco.MjData(self.model)
+        self._states = np.empty(0)  # of all steps of a call; a new array would be mapped each time
         self._rollout: Any = rollout.Rollout(nthread=self._threads if self._threads > 1 else 0)
 
     @property
@@ -93,7 +95,10 @@ class Physics:
     def advanced(self, state: Array, control: Array, models: list[Any]) -> Array:
         """What follows the rows of `state` (k, nstate), of one model or k, under `control` (k, steps, nu)."""
         count, steps = control.shape[:2]
-        states = np.empty((count, steps, state.shape[1]))
+        shape = count, steps, state.shape[1]
+        if self._states.size < math.prod(shape):
+            self._states = np.empty(math.prod(shape))
+        states = self._states[: math.prod(shape)].reshape(shape)
         chunk = max(1, count // (4 * self._threads))
         options = {"nstep": steps, "state": states, "skip_checks": True, "chunk_size": chunk}
         self._rollout.rollout(models if len(models) == count else models * count, self._data, state, control, **options)
@@ -111,7 +116,8 @@ class Physics:
 
     def __getstate__(self) -> dict[str, Any]:
         """The state without the objects that belong to this process."""
-        return {name: value for name, value in self.__dict__.items() if name not in ("_rollout", "_data", "_scratch")}
+        own = "_rollout", "_data", "_scratch", "_states"
+        return {name: value for name, value in self.__dict__.items() if name not in own}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore the result of `__getstate__`."""
