@@ -71,8 +71,7 @@ class TrainSettings:
     trial_threshold: Annotated[float, Meta(gt=0, lt=1, description="a share above 0 and below 1, such as 0.9")] = 0.9
     """Success rate that trials on a real robot must exceed before bam-deploy runs at full speed (default 0.9)."""
     eval_every: _Steps | None = None
-    """Steps between two evaluations (default a twentieth of the run, and at least 1000), or four times as many far from
-    until_success."""
+    """Steps between two evaluations (default a twentieth of the run, and at least 1000)."""
     eval_episodes: Annotated[int, Meta(ge=1, le=1_000_000)] = 20
     """Episodes of one evaluation (default: the preset's, or 20)."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)

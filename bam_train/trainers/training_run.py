@@ -36,8 +36,6 @@ SAVE_SHARE = 0.02
 """Maximum share of the time for saving: a large replay buffer is saved less often."""
 RECORD_EVERY = 0.1
 """Minimum seconds between two training records."""
-FAR, ONE_IN = 10, 4
-"""Factor that training episodes lack to `until_success` where only one in so many evaluations is made."""
 LEARNT_FOR, LEARNT_SHARE = 3.0, 0.01
 """Seconds, and share of the steps, of learning on which an estimate of the time left rests at least."""
 
@@ -122,7 +120,6 @@ class TrainingRun:
         self._evaluating = 0.0  # time that evaluations took [s]
         self._stop, self._reached = False, ""
         self._evaluated_at = trainer.steps if best or any(one["kind"] == "evaluation" for one in before) else 0
-        self._looked_at = self._evaluated_at  # steps at which it was last decided whether to evaluate
         self._scores: Scores = {}  # the newest evaluation
         self._played: list[PlayedEpisode] = []  # episodes of the best one, for a detector
         self._kept: Path | None = out if best else None
@@ -244,16 +241,11 @@ class TrainingRun:
         return not (self._stop or self._reached)
 
     def _due(self, progress: Progress) -> bool:
-        """Whether to evaluate: every `eval_every` steps, and earlier once training episodes reach the run's goal.
-
-        While they are far from `until_success`, one in `ONE_IN` is made.
-        """
+        """Whether to evaluate: every `eval_every` steps, and earlier once training episodes reach the run's goal."""
         settings, since = self.settings, progress.steps - self._evaluated_at
         every = settings.eval_every or settings.steps
-        before, self._looked_at = self._looked_at, progress.steps
-        if progress.steps // every > before // every:
-            rate = progress.statistics().success_rate
-            return rate is None or FAR * rate >= (settings.until_success or 0.0) or since >= ONE_IN * every
+        if progress.steps // every > self._evaluated_at // every:
+            return True
         if (settings.until_success is None and settings.stop_reward is None) or since < every / 4:
             return False
         return bool(_reached(progress.statistics(), settings))

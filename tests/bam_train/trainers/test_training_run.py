@@ -223,17 +223,6 @@ def test_training_that_succeeds_is_evaluated_early(start, share, steps):
     assert [row[0] for row in watcher.evaluations] == steps
 
 
-@pytest.mark.parametrize(
-    ("share", "steps"), [(0.08, [80, 100]), (0.1, [20, 40, 60, 80, 100]), (None, [20, 40, 60, 80, 100])]
-)
-def test_three_of_four_evaluations_are_left_out_while_training_is_far_from_success(start, share, steps):
-    results = dict.fromkeys(range(10, 101, 10), report(0.0))
-    run, trainer, watcher = start(results, until_success=0.9, eval_every=20)
-    trainer.statistics = replace(STATISTICS, success_rate=share)
-    run.run()
-    assert [row[0] for row in watcher.evaluations] == steps
-
-
 def test_success_that_nobody_reports_never_ends_a_run(start):
     run, _, watcher = start(at(None, None, None, None), until_success=0.9)
     assert run.run().reason == "steps"
