@@ -79,7 +79,7 @@ def test_film(corridor_checkpoint, starting_cell, run, tmp_path):
     pictures = sum(5 - starting_cell(seed) for seed in (7, 8))
     assert status == 0
     assert json.loads(out)["episodes"] == 4
-    assert err == f"bam-eval: {film}: 2 episodes, {pictures} pictures\n"
+    assert err == f"bam-eval: the video is {film}: 2 episodes, {pictures} pictures\n"
     with Image.open(film) as image:
         assert image.n_frames == pictures
         assert image.info["duration"] == 50
