@@ -2,7 +2,7 @@
 
 Only the main thread moves the robot: the loop of a `Deployment` while the policy drives, or the newest command of the
 person who has taken over. Requests wait in a queue and are executed by the main thread between two ticks; a halt is
-executed at once, in the thread in which it comes.
+executed at once, in the thread in which it comes, and so is a pause while the robot is being connected.
 
 Longer than most files: it is one object with one state, and every request that changes it.
 """
@@ -51,6 +51,8 @@ ROBOT_FITS = "the robot is there, and fits"
 _RECENT_EPISODES = 20  # episodes in the status
 _HALTING_REQUESTS = ("pause", "take")
 """Requests for which the robot is halted before they are executed."""
+_WITHOUT_ROBOT = ("pause", "resume")
+"""Requests that are executed also while the main thread connects the robot, which takes long on a busy computer."""
 
 
 def _advised(error: Exception) -> str:
@@ -119,7 +121,7 @@ class Resident:
         self._hurry = threading.Event()  # a request that ends the tick
         self._requests: deque[tuple[Callable[[], dict[str, Any] | None], int]] = deque()
         self._command: Drive | None = None
-        self._is_running, self._quitting = is_running, False
+        self._is_running, self._quitting, self._connecting = is_running, False, False
         self._stopped = self._paused = ""  # why, once a guard stopped the robot, and once a person or a fault paused it
         self._last_stop = ""  # why a guard stopped the robot, until a person resumes it
         self._was_connected = self._holds = self._was_cut_short = False
@@ -146,15 +148,25 @@ class Resident:
         elif isinstance(message, Halt):
             self.halt()
             if message.stop:
-                self.post(lambda: self._pause(message.who, message.address, message.why or "the stop button"))
+                why = message.why or "the stop button"
+                self.post(lambda: self._pause(message.who, message.address, why), without_robot=True)
         elif isinstance(message, Ask):
             self._ask(message)
 
-    def post(self, do: Callable[[], dict[str, Any] | None], number: int = 0) -> None:
-        """Let the main thread call `do` between two ticks; its result answers the request `number`. Thread-safe."""
+    def post(self, do: Callable[[], dict[str, Any] | None], number: int = 0, *, without_robot: bool = False) -> None:
+        """Let the main thread call `do` between two ticks; its result answers the request `number`. Thread-safe.
+
+        Args:
+            do: Called.
+            number: Of the request; 0: nobody waits.
+            without_robot: Call it in this thread, if the main thread connects the robot and no request waits.
+        """
         with self._news:
-            self._requests.append((do, number))
-            self._news.notify()
+            if without_robot and self._connecting and not self._requests:
+                self._answer(do, number)
+            else:
+                self._requests.append((do, number))
+                self._news.notify()
 
     def front_died(self) -> None:
         """The front process died, and with it every client: whoever drives holds now, and the agent is paused then."""
@@ -192,7 +204,8 @@ class Resident:
         elif do is None:
             self.send(Answer(ask.number, error=f"{ask.op}: this agent does not know that", kind="RequestRefused"))
         else:
-            self.post(lambda: do(ask.who, ask.address, **ask.arguments), ask.number)
+            without = ask.op in _WITHOUT_ROBOT
+            self.post(lambda: do(ask.who, ask.address, **ask.arguments), ask.number, without_robot=without)
             if ask.op in _HALTING_REQUESTS:
                 self._hurry.set()
                 self.halt()
@@ -244,13 +257,16 @@ class Resident:
         while self._requests:
             with self._news:
                 do, number = self._requests.popleft()
-            try:
-                result = do()
-                answer = Answer(number, result=result or {})
-            except (BamTrainError, BamEnvsError) as error:
-                answer = Answer(number, error=_advised(error), kind=kind_of(error))
-            if number:
-                self.send(answer)
+            self._answer(do, number)
+
+    def _answer(self, do: Callable[[], dict[str, Any] | None], number: int) -> None:
+        try:
+            result = do()
+            answer = Answer(number, result=result or {})
+        except (BamTrainError, BamEnvsError) as error:
+            answer = Answer(number, error=_advised(error), kind=kind_of(error))
+        if number:
+            self.send(answer)
 
     @property
     def _unnoticed_stop(self) -> SafetyStop | None:
@@ -463,21 +479,7 @@ class Resident:
         try:
             self._activate()
             checkpoint = Checkpoint.open(self.succession.active.path)
-            self.session = self._connect(
-                self.options,
-                checkpoint,
-                self._stage,
-                between_ticks=self.between_ticks,
-                observers=[
-                    self._look,
-                    TransitionCollector(
-                        self.transitions, lambda: self.succession.active.digest, lambda: self._was_cut_short
-                    ),
-                ],
-                switch=self.switch,
-                admit=self._admit,
-                sleep=self._hurry.wait,
-            )
+            self.session = self._connected_to(checkpoint)
         except (BamEnvsError, BamTrainError) as error:
             may_pass = isinstance(error, BamEnvsError) or (isinstance(error, ContractRefused) and error.passes)
             if not (self._was_connected or may_pass):
@@ -498,6 +500,29 @@ class Resident:
             self._change(State.STOPPED, self._stopped)
         elif not self._is_running:
             self._change(State.PAUSED, self._paused or ROBOT_FITS)
+
+    def _connected_to(self, checkpoint: Checkpoint) -> RobotSession:
+        try:
+            with self._news:
+                self._connecting = True
+            return self._connect(
+                self.options,
+                checkpoint,
+                self._stage,
+                between_ticks=self.between_ticks,
+                observers=[
+                    self._look,
+                    TransitionCollector(
+                        self.transitions, lambda: self.succession.active.digest, lambda: self._was_cut_short
+                    ),
+                ],
+                switch=self.switch,
+                admit=self._admit,
+                sleep=self._hurry.wait,
+            )
+        finally:
+            with self._news:
+                self._connecting = False
 
     def _drop(self, why: str) -> None:
         """Halt the robot and drop the link."""

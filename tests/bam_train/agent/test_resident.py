@@ -214,6 +214,35 @@ def test_a_busy_robot_is_waited_for_also_at_the_start_and_a_wrong_one_is_refused
         bench(connect=connect).agent.run()
 
 
+def test_a_pause_is_answered_while_the_robot_is_connected(bench):
+    begun, goes_on = threading.Event(), threading.Event()
+
+    def connect(*arguments, **more):
+        begun.set()
+        assert goes_on.wait(DEADLINE)
+        return Session(running.agent, running.faults)
+
+    running = bench(connect=connect)
+    with running:
+        assert begun.wait(DEADLINE)
+        running.ask("pause", who="boris")
+        running.ask("resume", who="boris")
+        assert running.ask("pause").result["state"] == State.WAITING.value
+        goes_on.set()
+        assert running.state(State.PAUSED) == "paused by anna"
+        running.ask("resume")
+        running.state(State.RUNNING)
+    assert [(what, text) for what, text, *_ in running.events if what in ("pause", "resume")] == [
+        ("pause", "paused by boris"),
+        ("resume", "resumed by boris"),
+        ("pause", "paused by anna"),
+    ]
+    assert running.changes()[:2] == [
+        (State.PAUSED.value, "paused by anna", "the agent"),
+        (State.RUNNING.value, "resumed by anna", "anna"),
+    ]
+
+
 def test_a_stop_while_a_request_is_executed_is_a_state_and_is_written_down_once(bench):
     with bench() as running:
         running.state(State.RUNNING)
