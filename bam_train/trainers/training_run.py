@@ -386,11 +386,13 @@ def evaluate_for_goal(
 
     The third result are episodes, about `WANTED` steps at most, if a detector can be made of them; see `parts_of`.
 
-    If the goal was reached, as many other episodes are played, which must reach it too. Failures that rule
-    `until_success` out end an evaluation, see `evaluate`, but not the last one of a run, which plays all. Episode k has
-    the seed EVALUATION_SEED + seed + k; `envs` are left open.
+    If the goal was reached, as many other episodes are played, which must reach it too; not after episodes none of
+    which failed, where `until_success` allows a failure. Failures that rule `until_success` out end an evaluation, see
+    `evaluate`, but not the last one of a run, which plays all. Episode k has the seed EVALUATION_SEED + seed + k;
+    `envs` are left open.
     """
     episodes, wanted, most = settings.eval_episodes, settings.until_success, math.inf
+    allowed = 0.0 if wanted is None else (1 - wanted) * episodes + 1e-9
     played: list[PlayedEpisode] = []
 
     def on_wave(wave: list[PlayedEpisode], _: int) -> None:
@@ -398,7 +400,7 @@ def evaluate_for_goal(
             played.extend(wave)
 
     if wanted is not None and settings.stop_reward is None and not last:
-        most = (1 - wanted) * episodes + 1e-9
+        most = allowed
 
     def play(first: int, count: int) -> EvaluationReport:
         seed = EVALUATION_SEED + settings.seed + first
@@ -406,8 +408,9 @@ def evaluate_for_goal(
         return evaluate(policy, settings.env, settings.env_kwargs, **given, parts=parts_of, on_wave=on_wave)
 
     report = play(0, episodes)
-    if not _reached(report, settings):
-        return report, "", played
+    goal = _reached(report, settings)
+    if not goal or (goal == "success" and allowed >= 1 and report.successes == report.episodes):
+        return report, goal, played
     again = play(episodes, episodes)
     worse = min(report, again, key=lambda report: (report.success_rate or 0.0, report.return_mean or 0.0))
     return worse, _reached(again, settings), played

@@ -196,13 +196,21 @@ def test_a_run_that_goes_on_without_its_best_evaluates_when_it_would_have(start)
 
 
 def test_success_must_be_confirmed_by_fresh_episodes(start):
-    lucky, lasting = [report(1.0), report(0.8)], [report(1.0), report(0.9)]
+    lucky, lasting = [report(0.9), report(0.8)], [report(0.9), report(0.9)]
     run, _, watcher = start({30: [report(0.0, episodes=3)], 60: lucky, 90: lasting}, until_success=0.9)
     outcome = run.run()
     whole, fresh = (2_000_007, 10), (2_000_017, 10)
     assert start.seeds == [(30, *whole)] + [(step, *asked) for step in (60, 90) for asked in (whole, fresh)]
     assert [row[:2] for row in watcher.evaluations] == [(30, 0.0), (60, 0.8), (90, 0.9)]
     assert (outcome.reason, outcome.steps, outcome.best["steps"]) == ("success", 90, 90)
+
+
+@pytest.mark.parametrize(("wanted", "times"), [(0.9, 1), (0.95, 2)])  # of ten episodes one may fail, or none
+def test_episodes_without_a_failure_need_no_others_where_a_failure_is_allowed(start, wanted, times):
+    run, _, watcher = start({30: [report(1.0)] * times}, until_success=wanted)
+    outcome = run.run()
+    assert (outcome.reason, outcome.steps, len(start.seeds)) == ("success", 30, times)
+    assert [row[:2] for row in watcher.evaluations] == [(30, 1.0)]
 
 
 def test_failures_that_rule_the_goal_out_end_every_evaluation_but_the_last(start):
