@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +35,7 @@ from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import Stopped, StopSwitch, fault_text
 from bam_train.deploy.episode import EpisodeStep
-from bam_train.deploy.journal import EpisodeRecord
+from bam_train.deploy.journal import LATE, EpisodeRecord
 from bam_train.errors import BamTrainError, ContractRefused, FormatError, PolicyError, RequestRefused, kind_of
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ _log = logging.getLogger(__name__)
 _LINK_POLL_PERIOD = 0.2  # time between two looks at the link while the robot rests [s]
 _RECONNECT_PERIOD = 1.0  # time between two attempts to reach the robot [s]
 _REPORT_PERIOD = 0.5  # time between two reports while nothing changes [s]
+_WARN_PERIOD = 60.0  # least time between two lines of the log with warnings of the same guard [s]
 COMMAND_LIFETIME = 0.2
 """Age of a person's newest command from which the robot rests, at least one and a half periods [s]."""
 ROBOT_FITS = "the robot is there, and fits"
@@ -58,6 +60,12 @@ _WITHOUT_ROBOT = ("pause", "resume")
 def _advised(error: Exception) -> str:
     """The exception in one line, which says what ends a stop of the agent's robot."""
     return fault_text(error).replace("call resume()", "resume the agent")
+
+
+def _late_so_far(status: Mapping[str, Any]) -> str:
+    """What the trials of a candidate count, beside the guard's warning."""
+    missed = f"{status['late']} of {status['ticks']} ticks missed their deadline so far"
+    return f"; {missed}, {status['slow']} because of the policy"
 
 
 class _Interrupted(BaseException):
@@ -122,7 +130,8 @@ class Resident:
         self._requests: deque[tuple[Callable[[], dict[str, Any] | None], int]] = deque()
         self._command: Drive | None = None
         self._is_running, self._quitting, self._connecting = is_running, False, False
-        self._stopped = self._paused = ""  # why, once a guard stopped the robot, and once a person or a fault paused it
+        # Why, once a guard stopped the robot, and once a person or a fault paused it.
+        self._stopped, self._paused = "", "" if is_running else "it started paused"
         self._last_stop = ""  # why a guard stopped the robot, until a person resumes it
         self._was_connected = self._holds = self._was_cut_short = False
         self._seed, self._reported = options.seed, 0.0
@@ -130,6 +139,7 @@ class Resident:
         self._ticks = self._completed = self._successes = 0
         self._late = self._slow = 0  # late ticks of earlier connections, and those that a policy made late
         self._link_ms = self._loop_ms = 0.0
+        self._warned: dict[str, tuple[str, float]] = {}  # by guard: its last warning in the log, and when [s]
 
     # ---- what other threads call
 
@@ -741,6 +751,17 @@ class Resident:
         now = time.monotonic()
         if now - self._reported >= least:
             self._reported = now
-            self.send(Report(self.status()))
+            status = self.status()
+            self.send(Report(status))
+            self._log_warnings(status, now)
             if self.transitions.wanted and (rows := self.transitions.take()) is not None:
                 self.send(Rows(encode(rows)))
+
+    def _log_warnings(self, status: Mapping[str, Any], now: float) -> None:
+        """Write the new warnings of a `status` to the log; `now` in s."""
+        for text in status["warnings"]:
+            title = text.partition(": ")[0]
+            before, at = self._warned.get(title, ("", -math.inf))
+            if text != before and now - at >= _WARN_PERIOD:
+                self._warned[title] = text, now
+                self._tell(f"warning: {text}{_late_so_far(status) if title == LATE else ''}")

@@ -153,9 +153,14 @@ class Pacer:
         return Lateness(float(p50), float(p99), self._latest)
 
 
+def least_lateness(period: float) -> float:
+    """The delay from which on a tick counts as late, for a `period` [s]."""
+    return max(_LATE_BY * period, _JITTER)
+
+
 def is_disturbed(late: float, period: float) -> bool:
     """Whether a tick that began `late` [s] after its deadline shows that the computer was busy; `period` is in s."""
-    return late > max(_LATE_BY * period, _JITTER)
+    return late > least_lateness(period)
 
 
 class TickTimes:

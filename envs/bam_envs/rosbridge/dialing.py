@@ -5,7 +5,7 @@ import socket
 import ssl
 
 from bam_envs.core.errors import NoServer
-from bam_envs.core.location import LiveRobot
+from bam_envs.core.location import LiveRobot, is_loopback
 from bam_envs.rosbridge.endpoint import Address
 
 _HOST_MISMATCH = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
@@ -78,7 +78,7 @@ def no_connection(
         example = " In examples it stands for the robot's computer." if address.host in ("robot", "gpu") else ""
         return f"the name {address.host!r} is not known: {error.strerror}. Try the IP address.{example}"
     if isinstance(error, ConnectionRefusedError):
-        here = f"Start one with `{stand_in} --port {address.port}` or `{_LAUNCH}`."
+        here = f"Start one with `{stand_in} --port {address.port}` or `{_launch(address)}`."
         if address.port == AGENT_PORT:
             start = start or f"{AGENT_PORT} is the port of bam-agent: does it run there? {here}"
         return f"refused: nothing listens there. Is the port open? {start or here}"
@@ -86,6 +86,12 @@ def no_connection(
         hint = "If the server has no TLS, use ws://." if address.secure else "Is it the right port?"
         return f"the connection was cut while it was made. {hint}"
     return f"cannot be reached: {error.strerror or error}."
+
+
+def _launch(address: Address) -> str:
+    """The command that starts a rosbridge server there; one for this computer listens to nobody else."""
+    near = f" address:={'127.0.0.1' if address.host == 'localhost' else address.host}"
+    return f"{_LAUNCH} port:={address.port}{near if is_loopback(address.host) else ''}"
 
 
 def silent(address: Address, timeout: float) -> str:

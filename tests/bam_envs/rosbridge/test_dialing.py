@@ -51,8 +51,21 @@ def test_refused(free_port):
     assert failure(f"ws://127.0.0.1:{free_port}") == (
         "refused: nothing listens there. Is the port open? "
         f"Start one with `bam-serve --env bam/pick --port {free_port}` "
-        "or `ros2 launch rosbridge_server rosbridge_websocket_launch.xml`."
+        f"or `ros2 launch rosbridge_server rosbridge_websocket_launch.xml port:={free_port} address:=127.0.0.1`."
     )
+
+
+@pytest.mark.parametrize(
+    ("url", "flags"),
+    [
+        ("ws://localhost", "port:=9090 address:=127.0.0.1"),
+        ("ws://[::1]:9091", "port:=9091 address:=::1"),
+        ("ws://10.0.0.5", "port:=9090"),
+    ],
+)
+def test_what_is_started_for_this_computer_listens_to_nobody_else(url, flags):
+    text = no_connection(Endpoint(url).address, ConnectionRefusedError(), 1.0)
+    assert text.endswith(f"`ros2 launch rosbridge_server rosbridge_websocket_launch.xml {flags}`.")
 
 
 def test_refused_at_the_port_of_live_agents():

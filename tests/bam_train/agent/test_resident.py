@@ -18,6 +18,7 @@ from bam_train.agent.resident import Resident
 from bam_train.agent.succession import Choice
 from bam_train.agent.versions import CANDIDATE, Versions
 from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.journal import LATE as LATE_TICKS
 from bam_train.deploy.journal import Journal
 from bam_train.errors import ContractRefused
 
@@ -96,14 +97,14 @@ class Bench:
     def __init__(self, folder, *, is_running=True, connect=None, **options):
         versions = Versions(folder / "versions")
         versions.first(PICK)
-        self.faults, self.events, self._answers = deque(), [], queue.Queue()
+        self.faults, self.events, self.log, self._answers = deque(), [], [], queue.Queue()
         self._number, self._changed, self.reports, self._seen = 0, threading.Condition(), [{}], 0
         self.agent = Resident(
             AgentOptions(LiveRobot("ws://127.0.0.1:1"), folder, **options),
             versions,
             SimpleNamespace(write=self._write, fault=""),
             send=self._take,
-            tell=lambda line: None,
+            tell=self.log.append,
             admit=lambda env, lines: None,
             is_running=is_running,
             connect=connect or (lambda *arguments, **more: Session(self.agent, self.faults)),
@@ -257,6 +258,27 @@ def test_a_stop_while_a_request_is_executed_is_a_state_and_is_written_down_once(
         (State.TAKEN_OVER.value, "taken over by a program", "a program"),
         (State.STOPPED.value, why, "the agent"),
     ]
+
+
+def test_late_ticks_are_said_in_the_log_but_not_in_each_report(bench):
+    def warned():
+        return [line for line in running.log if line.startswith("warning: ")]
+
+    late = f"{LATE_TICKS}: 7 of the last 100 commands were more than 5 ms late"
+    with bench() as running:
+        running.state(State.RUNNING)
+        session = running.agent.session
+        for missed, acted in ((1, 0.0), (1, 0.2)):  # the computer's, and the policy's
+            session.deployment.times.add(0.1, missed, acted, acted)
+        session.deployment.journal.warn([late, "state age (G3): old"])
+        running.ask("pause")
+        so_far = "2 of 0 ticks missed their deadline so far, 1 because of the policy"
+        assert warned() == [f"warning: {late}; {so_far}", "warning: state age (G3): old"]
+        session.deployment.journal.warn([late.replace("7", "8")])
+        running.ask("resume")
+        running.ask("pause")
+        assert running.status["warnings"][0] == late.replace("7", "8")
+    assert len(warned()) == 2
 
 
 def test_a_request_that_comes_on_the_way_to_a_scene_ends_that_and_not_the_agent(bench):
