@@ -15,7 +15,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +45,7 @@ _log = logging.getLogger(__name__)
 _LINK_POLL_PERIOD = 0.2  # time between two looks at the link while the robot rests [s]
 _RECONNECT_PERIOD = 1.0  # time between two attempts to reach the robot [s]
 _REPORT_PERIOD = 0.5  # time between two reports while nothing changes [s]
-_WARN_PERIOD = 60.0  # least time between two lines of the log with warnings of the same guard [s]
+_LOG_PERIOD = 60.0  # least time between two warnings of a guard in the log, and two reasons to wait for the robot [s]
 COMMAND_LIFETIME = 0.2
 """Age of a person's newest command from which the robot rests, at least one and a half periods [s]."""
 ROBOT_FITS = "the robot is there, and fits"
@@ -60,12 +60,6 @@ _WITHOUT_ROBOT = ("pause", "resume")
 def _advised(error: Exception) -> str:
     """The exception in one line, which says what ends a stop of the agent's robot."""
     return fault_text(error).replace("call resume()", "resume the agent")
-
-
-def _late_so_far(status: Mapping[str, Any]) -> str:
-    """What the trials of a candidate count, beside the guard's warning."""
-    missed = f"{status['late']} of {status['ticks']} ticks missed their deadline so far"
-    return f"; {missed}, {status['slow']} because of the policy"
 
 
 class _Interrupted(BaseException):
@@ -139,7 +133,7 @@ class Resident:
         self._ticks = self._completed = self._successes = 0
         self._late = self._slow = 0  # late ticks of earlier connections, and those that a policy made late
         self._link_ms = self._loop_ms = 0.0
-        self._warned: dict[str, tuple[str, float]] = {}  # by guard: its last warning in the log, and when [s]
+        self._logged: dict[str, tuple[str, float]] = {}  # by title: the last line of the log, and when [s]
 
     # ---- what other threads call
 
@@ -496,6 +490,7 @@ class Resident:
                 raise  # a setting, a file or a robot that is wrong when the program starts
             if not self._stopped:
                 self._change(State.WAITING, fault_text(error))
+                self._log_anew(self.state.value, f"{self.state.value}: {self.why}")
             with self._news:
                 self._news.wait_for(lambda: bool(self._requests), _RECONNECT_PERIOD)
             self._report(_REPORT_PERIOD)
@@ -694,7 +689,8 @@ class Resident:
 
     def note(self, what: str, text: str, who: str = "the agent", where: str = "", before: State | None = None) -> None:
         """Write to the log, the recording and the audit file; `before` is the state that the event has changed."""
-        self._tell(text)
+        if what != "refused":  # which the front process has logged, with the address
+            self._tell(text)
         if self.session is not None:
             self.session.event(f"{text} ({who}{f' at {where}' if where else ''})")
         after, digest = None if before is None else self.state, self.succession.active.digest
@@ -743,6 +739,8 @@ class Resident:
         found, session = [], self.session
         if session is not None:
             found = [f"{title}: {text}" for title, text in session.deployment.journal.warnings.items()]
+            if LATE not in session.deployment.journal.warnings and (late := session.deployment.times.warning):
+                found.append(f"late ticks: {late}")
             found += [f"recording: {session.recording_fault}"] if session.recording_fault else []
         return [*found, *([f"audit: {self.audit.fault}"] if self.audit.fault else [])]
 
@@ -753,15 +751,14 @@ class Resident:
             self._reported = now
             status = self.status()
             self.send(Report(status))
-            self._log_warnings(status, now)
+            for warning in status["warnings"]:
+                self._log_anew(warning.partition(": ")[0], f"warning: {warning}")
             if self.transitions.wanted and (rows := self.transitions.take()) is not None:
                 self.send(Rows(encode(rows)))
 
-    def _log_warnings(self, status: Mapping[str, Any], now: float) -> None:
-        """Write the new warnings of a `status` to the log; `now` in s."""
-        for text in status["warnings"]:
-            title = text.partition(": ")[0]
-            before, at = self._warned.get(title, ("", -math.inf))
-            if text != before and now - at >= _WARN_PERIOD:
-                self._warned[title] = text, now
-                self._tell(f"warning: {text}{_late_so_far(status) if title == LATE else ''}")
+    def _log_anew(self, title: str, text: str) -> None:
+        """Write `text` to the log, unless it is the last one of this `title`, or that came less than a minute ago."""
+        now, (before, at) = time.monotonic(), self._logged.get(title, ("", -math.inf))
+        if text != before and now - at >= _LOG_PERIOD:
+            self._logged[title] = text, now
+            self._tell(text)

@@ -264,21 +264,48 @@ def test_late_ticks_are_said_in_the_log_but_not_in_each_report(bench):
     def warned():
         return [line for line in running.log if line.startswith("warning: ")]
 
-    late = f"{LATE_TICKS}: 7 of the last 100 commands were more than 5 ms late"
     with bench() as running:
         running.state(State.RUNNING)
         session = running.agent.session
-        for missed, acted in ((1, 0.0), (1, 0.2)):  # the computer's, and the policy's
-            session.deployment.times.add(0.1, missed, acted, acted)
-        session.deployment.journal.warn([late, "state age (G3): old"])
+        for tick in [IN_TIME] * 94 + [LATE] * 4 + [SLOW] * 2:
+            session.deployment.times.add(*tick)
+        session.deployment.journal.warn(["link quality (G16): only 93 of the last 100 ticks"])
         running.ask("pause")
-        so_far = "2 of 0 ticks missed their deadline so far, 1 because of the policy"
-        assert warned() == [f"warning: {late}; {so_far}", "warning: state age (G3): old"]
-        session.deployment.journal.warn([late.replace("7", "8")])
+        late = "6 of the last 100 ticks missed their deadline (6 so far, 2 of them because of the policy)"
+        late = f"late ticks: {late}: end other programs, or use a faster policy"
+        assert running.status["warnings"] == ["link quality (G16): only 93 of the last 100 ticks", late]
+        assert warned() == [f"warning: {one}" for one in running.status["warnings"]]
+        session.deployment.times.add(*LATE)
         running.ask("resume")
         running.ask("pause")
-        assert running.status["warnings"][0] == late.replace("7", "8")
-    assert len(warned()) == 2
+        assert running.status["warnings"][1] == late.replace("6 of the last", "7 of the last").replace("(6", "(7")
+        assert len(warned()) == 2
+        session.deployment.journal.warn([f"{LATE_TICKS}: 7 of the last 100 commands were late"])  # says the same
+        running.ask("resume")
+        assert [one.partition(":")[0] for one in running.status["warnings"]] == ["link quality (G16)", LATE_TICKS]
+
+
+def test_what_the_front_process_logs_is_not_logged_twice(bench):
+    with bench() as running:
+        running.state(State.RUNNING)
+        refusal = running.ask("use", version="ffff").error
+        running.ask("transitions", on=False)  # in a later turn
+        assert ("refused", refusal, "anna", None, None) in running.events
+        assert refusal not in running.log
+
+
+def test_why_the_robot_is_waited_for_is_in_the_log(bench):
+    tried = threading.Event()
+
+    def connect(*arguments, **more):
+        if running.agent.why == "nothing listens there":
+            tried.set()
+        raise LinkLost("nothing listens there")
+
+    running = bench(connect=connect)
+    with running:
+        assert tried.wait(DEADLINE)
+    assert running.log == ["waiting for the robot: nothing listens there"]
 
 
 def test_a_request_that_comes_on_the_way_to_a_scene_ends_that_and_not_the_agent(bench):
