@@ -31,7 +31,7 @@ from bam_envs.core.errors import BamEnvsError, LinkLost, NoServer
 from bam_envs.core.location import Credentials
 from bam_envs.core.wording import brief
 from bam_envs.rosbridge.bus import tell
-from bam_envs.rosbridge.dialing import AGENT_PORT, http_refusal, no_connection, open_port, silent
+from bam_envs.rosbridge.dialing import AGENT_PORT, http_refusal, no_connection, no_websocket, open_port, silent
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.threads import LoopThread
 from bam_train.agent.remote.agent_protocol import CHUNK, PATH, PROTOCOL, Stage, When
@@ -316,8 +316,7 @@ class AgentClient:
         except ValueError as error:  # a redirect, which leads to another server than the one that was meant
             raise NoServer(address.url, f"a web server answers there: {error}. Is it the right port?") from error
         except WebSocketException as error:
-            text = f"something listens there that is no WebSocket server ({error.__cause__ or error})."
-            raise NoServer(address.url, f"{text} If it has TLS, use wss://.") from error
+            raise NoServer(address.url, no_websocket(error.__cause__ or error)) from error
 
     async def _hello(self, socket: ClientConnection) -> Any:
         first = asyncio.ensure_future(socket.recv())

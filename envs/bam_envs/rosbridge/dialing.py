@@ -101,6 +101,12 @@ def silent(address: Address, timeout: float) -> str:
     return f"{text}{hint}"
 
 
+def no_websocket(reason: object) -> str:
+    """The text about a server that sent something else than the answer to a WebSocket's opening handshake."""
+    hint = "If it has TLS, use wss://; if it is the port of bam-serve --tcp, tcp://."
+    return f"something listens there that is no WebSocket server ({reason}). {hint}"
+
+
 def http_refusal(status: int, body: bytes) -> str:
     """The reason why a web server did not open a WebSocket, by its response."""
     said = body[:300].decode(errors="replace").strip()

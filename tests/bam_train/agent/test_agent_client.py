@@ -195,4 +195,6 @@ def test_tls(new_server, tmp_path, certificates):
         assert agent.ask("status")["state"] == "paused"
     assert "the certificate is not trusted" in refused(server.url, token_file=tmp_path / "token")
     plain = server.url.replace("wss:", "ws:")
-    assert refused(plain, token_file=tmp_path / "token").endswith("If it has TLS, use wss://.")
+    assert refused(plain, token_file=tmp_path / "token").endswith(
+        " If it has TLS, use wss://; if it is the port of bam-serve --tcp, tcp://."
+    )
