@@ -15,7 +15,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -735,23 +735,28 @@ class Resident:
         }
 
     def _warnings(self) -> list[str]:
-        """What the operator should know: of the guards, the recording and the audit file."""
-        found, session = [], self.session
-        if session is not None:
-            found = [f"{title}: {text}" for title, text in session.deployment.journal.warnings.items()]
-            if LATE not in session.deployment.journal.warnings and (late := session.deployment.times.warning):
-                found.append(f"late ticks: {late}")
-            found += [f"recording: {session.recording_fault}"] if session.recording_fault else []
+        """What the operator should know: of the guards, the ticks, the recording and the audit file."""
+        session = self.session
+        found = [*self._motion_warnings()]
+        found += [f"recording: {session.recording_fault}"] if session is not None and session.recording_fault else []
         return [*found, *([f"audit: {self.audit.fault}"] if self.audit.fault else [])]
+
+    def _motion_warnings(self) -> Iterator[str]:
+        """Those of the guards, and of late ticks."""
+        if self.session is None:
+            return
+        warnings, late = self.session.deployment.journal.warnings, self.session.deployment.times.warning
+        yield from (f"{title}: {text}" for title, text in warnings.items())
+        if late and LATE not in warnings:
+            yield f"late ticks: {late}"
 
     def _report(self, least: float = 0.0) -> None:
         """Send the status, and transitions, unless the last ones are younger than `least` [s]."""
         now = time.monotonic()
         if now - self._reported >= least:
             self._reported = now
-            status = self.status()
-            self.send(Report(status))
-            for warning in status["warnings"]:
+            self.send(Report(self.status()))
+            for warning in self._motion_warnings():  # recorder and audit file log theirs
                 self._log_anew(warning.partition(": ")[0], f"warning: {warning}")
             if self.transitions.wanted and (rows := self.transitions.take()) is not None:
                 self.send(Rows(encode(rows)))
