@@ -211,7 +211,7 @@ class TickTimes:
             return ""
         late_ones = f"{late} of the last {seen} ticks missed their deadline"
         so_far = f"{self.late} so far, {self.slow} of them because of the policy"
-        return f"{late_ones} ({so_far}): end other programs, or use a faster policy"
+        return f"{late_ones} ({so_far}): {'use a faster policy' if 2 * self.slow > self.late else 'end other programs'}"
 
     @property
     def computed(self) -> float:

@@ -272,7 +272,7 @@ def test_late_ticks_are_said_in_the_log_but_not_in_each_report(bench):
         session.deployment.journal.warn(["link quality (G16): only 93 of the last 100 ticks"])
         running.ask("pause")
         late = "6 of the last 100 ticks missed their deadline (6 so far, 2 of them because of the policy)"
-        late = f"late ticks: {late}: end other programs, or use a faster policy"
+        late = f"late ticks: {late}: end other programs"
         assert running.status["warnings"] == ["link quality (G16): only 93 of the last 100 ticks", late]
         assert warned() == [f"warning: {one}" for one in running.status["warnings"]]
         session.deployment.times.add(*LATE)
