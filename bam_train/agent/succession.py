@@ -261,13 +261,13 @@ class Succession:
     def _wait_for_outcome(self, choice: Choice, number: int) -> None:
         """Wait for the end of the trials; meanwhile, say why they rest, and that they go on."""
         resident, end = self._resident, time.monotonic() + _TRIAL_TIMEOUT
-        told = resident.state
+        told, goes = resident.state, "begin"
         while not choice.outcome.wait(_STATE_POLL_PERIOD):
-            state = resident.state
+            state, goes = resident.state, "go on" if told.drives else goes
             if state.drives and not told.drives:
-                resident.send(RequestProgress(number, "the trials go on"))
+                resident.send(RequestProgress(number, f"the trials {goes}"))
             elif state is not told and state in _ONCE and not choice.result:
-                resident.send(RequestProgress(number, self._rests(state, "The trials go on")))
+                resident.send(RequestProgress(number, self._rests(state, f"The trials {goes}")))
             told = state
             if time.monotonic() > end:
                 raise RequestRefused("the trial did not end in a day")

@@ -145,7 +145,7 @@ def test_who_waits_for_the_trials_is_told_why_they_rest(agent, better, until, fi
     if first is State.PAUSED:  # the trials have not begun
         paused = f"the agent is paused {since}: paused by bob: lunch. Its trials begin {once}bam-agent resume URL"
         until(lambda: agent.sent[-1] == RequestProgress(1, f"is the candidate; {paused}"))
-        tell(State.TRIAL, "resumed by bob", "the trials go on")
+        tell(State.TRIAL, "resumed by bob", "the trials begin")
     else:
         tell(State.TRIAL, "push by anna", "acts as the candidate; its trials decide")
     why = "The robot was stopped by following (G23): the elbow is away. When it is safe, resume the agent."
