@@ -20,6 +20,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Literal
 
+from bam_envs.core.timing import BUSY, WINDOW
 from bam_train.deploy.trials import ALPHA, Evidence
 from bam_train.errors import SettingsError
 
@@ -27,8 +28,6 @@ _ODDS = (2.0, 4.0, 16.0)
 """The alternatives m."""
 _SHOWN = 20
 """Number of the last episodes that a reason mentions."""
-SLOW_SHARE, _FEWEST = 0.05, 100
-"""Largest share of the ticks of these episodes that a policy may make late, and the fewest ticks that show it."""
 
 
 @dataclass(frozen=True)
@@ -113,8 +112,8 @@ class Probation:
         self._episodes += 1
         self._ticks.append((slow, ticks))
         slow, ticks = map(sum, zip(*self._ticks, strict=True))
-        if ticks >= _FEWEST and slow > SLOW_SHARE * ticks:
-            most = f"at most {100 * SLOW_SHARE:g} % may be"
+        if ticks >= WINDOW and slow > BUSY * ticks:
+            most = f"at most {100 * BUSY:g} % may be"
             return self._back(f"its actions took so long that {slow} of {ticks} ticks were late, and {most}")
         if stopped_by:
             self._stops.append(self._episodes)

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +35,7 @@ from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.deployment import Stopped, StopSwitch, fault_text
 from bam_train.deploy.episode import EpisodeStep
-from bam_train.deploy.journal import EpisodeRecord
+from bam_train.deploy.journal import LATE, EpisodeRecord
 from bam_train.errors import BamTrainError, ContractRefused, FormatError, PolicyError, RequestRefused, kind_of
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ _log = logging.getLogger(__name__)
 _LINK_POLL_PERIOD = 0.2  # time between two looks at the link while the robot rests [s]
 _RECONNECT_PERIOD = 1.0  # time between two attempts to reach the robot [s]
 _REPORT_PERIOD = 0.5  # time between two reports while nothing changes [s]
+_LOG_PERIOD = 60.0  # least time between two warnings of a guard in the log, and two reasons to wait for the robot [s]
 COMMAND_LIFETIME = 0.2
 """Age of a person's newest command from which the robot rests, at least one and a half periods [s]."""
 ROBOT_FITS = "the robot is there, and fits"
@@ -122,7 +124,8 @@ class Resident:
         self._requests: deque[tuple[Callable[[], dict[str, Any] | None], int]] = deque()
         self._command: Drive | None = None
         self._is_running, self._quitting, self._connecting = is_running, False, False
-        self._stopped = self._paused = ""  # why, once a guard stopped the robot, and once a person or a fault paused it
+        # Why, once a guard stopped the robot, and once a person or a fault paused it.
+        self._stopped, self._paused = "", "" if is_running else "it started paused"
         self._last_stop = ""  # why a guard stopped the robot, until a person resumes it
         self._was_connected = self._holds = self._was_cut_short = False
         self._seed, self._reported = options.seed, 0.0
@@ -130,6 +133,7 @@ class Resident:
         self._ticks = self._completed = self._successes = 0
         self._late = self._slow = 0  # late ticks of earlier connections, and those that a policy made late
         self._link_ms = self._loop_ms = 0.0
+        self._logged: dict[str, tuple[str, float]] = {}  # by title: the last line of the log, and when [s]
 
     # ---- what other threads call
 
@@ -486,6 +490,7 @@ class Resident:
                 raise  # a setting, a file or a robot that is wrong when the program starts
             if not self._stopped:
                 self._change(State.WAITING, fault_text(error))
+                self._log_anew(self.state.value, f"{self.state.value}: {self.why}")
             with self._news:
                 self._news.wait_for(lambda: bool(self._requests), _RECONNECT_PERIOD)
             self._report(_REPORT_PERIOD)
@@ -684,7 +689,8 @@ class Resident:
 
     def note(self, what: str, text: str, who: str = "the agent", where: str = "", before: State | None = None) -> None:
         """Write to the log, the recording and the audit file; `before` is the state that the event has changed."""
-        self._tell(text)
+        if what != "refused":  # which the front process has logged, with the address
+            self._tell(text)
         if self.session is not None:
             self.session.event(f"{text} ({who}{f' at {where}' if where else ''})")
         after, digest = None if before is None else self.state, self.succession.active.digest
@@ -729,12 +735,20 @@ class Resident:
         }
 
     def _warnings(self) -> list[str]:
-        """What the operator should know: of the guards, the recording and the audit file."""
-        found, session = [], self.session
-        if session is not None:
-            found = [f"{title}: {text}" for title, text in session.deployment.journal.warnings.items()]
-            found += [f"recording: {session.recording_fault}"] if session.recording_fault else []
+        """What the operator should know: of the guards, the ticks, the recording and the audit file."""
+        session = self.session
+        found = [*self._motion_warnings()]
+        found += [f"recording: {session.recording_fault}"] if session is not None and session.recording_fault else []
         return [*found, *([f"audit: {self.audit.fault}"] if self.audit.fault else [])]
+
+    def _motion_warnings(self) -> Iterator[str]:
+        """Those of the guards, and of late ticks."""
+        if self.session is None:
+            return
+        warnings, late = self.session.deployment.journal.warnings, self.session.deployment.times.warning
+        yield from (f"{title}: {text}" for title, text in warnings.items())
+        if late and LATE not in warnings:
+            yield f"late ticks: {late}"
 
     def _report(self, least: float = 0.0) -> None:
         """Send the status, and transitions, unless the last ones are younger than `least` [s]."""
@@ -742,5 +756,14 @@ class Resident:
         if now - self._reported >= least:
             self._reported = now
             self.send(Report(self.status()))
+            for warning in self._motion_warnings():  # recorder and audit file log theirs
+                self._log_anew(warning.partition(": ")[0], f"warning: {warning}")
             if self.transitions.wanted and (rows := self.transitions.take()) is not None:
                 self.send(Rows(encode(rows)))
+
+    def _log_anew(self, title: str, text: str) -> None:
+        """Write `text` to the log, unless it is the last one of this `title`, or that came less than a minute ago."""
+        now, (before, at) = time.monotonic(), self._logged.get(title, ("", -math.inf))
+        if text != before and now - at >= _LOG_PERIOD:
+            self._logged[title] = text, now
+            self._tell(text)

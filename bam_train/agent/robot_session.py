@@ -25,7 +25,7 @@ from bam_train.deploy.flight import deployment_facts, flight_recorder, recording
 from bam_train.deploy.journal import Journal
 from bam_train.deploy.live_robot import watch_cameras
 from bam_train.environments import control_period, environment_of, interface_of, make_env
-from bam_train.errors import BamTrainError
+from bam_train.errors import BamTrainError, SettingsError
 from bam_train.recording.recorder import Recorder
 from bam_train.recording.recording import Recording
 
@@ -92,6 +92,9 @@ class RobotSession:
         make = partial(make_env, self.env_id, self.env_kwargs)
         self._env, place, known = bring_up(make, at, examine, trial_if_real=stage != "full")
         try:
+            if self.robot.info.agent:
+                text = "that is a live agent (bam-agent), and has the robot already; push to it with bam-push"
+                raise SettingsError(f"{options.robot.text}: {text}")
             self.is_real = has_real_robot(self._env)
             self.stage = stage or ("trial" if self.is_real else "full")
             """The stage at which the robot moves."""

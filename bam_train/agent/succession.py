@@ -39,9 +39,9 @@ ROBOT_TIMEOUT = 20.0
 _STATE_POLL_PERIOD = 0.2  # [s]
 _ONCE = {
     State.WAITING: "the robot is there again",
-    State.PAUSED: "somebody resumes the agent: bam-agent resume",
+    State.PAUSED: "somebody resumes the agent: bam-agent resume URL",
     State.TAKEN_OVER: "the robot is handed back and the agent runs",
-    State.STOPPED: "somebody resumes the agent: bam-agent resume",
+    State.STOPPED: "somebody resumes the agent: bam-agent resume URL",
 }
 """What ends each state in which there are no trials."""
 
@@ -83,6 +83,7 @@ class ActingAgent(Protocol):
     session: RobotSession | None
     state: State
     why: str
+    since: float
 
     def send(self, message: Message) -> None:
         """Send a message to the front process."""
@@ -233,14 +234,17 @@ class Succession:
         resident, arguments = self._resident, ask.arguments
         choice = self._made(version, ask, session)
         when = "tick" if choice.at_once else "episode"
-        resident.send(RequestProgress(ask.number, f"accepted; it acts from the next {when} on"))
+        news = f"it acts from the next {when} on"
+        if resident.state is State.TAKEN_OVER:
+            news = self._rests(State.TAKEN_OVER, "It acts")
+        resident.send(RequestProgress(ask.number, f"accepted; {news}"))
         resident.choose(choice)
         if not choice.active.wait(_EPISODE_TIMEOUT):
             raise RequestRefused(f"{version.digest[:12]} was accepted, and did not become active in an hour")
         if arguments.get("wait") and choice.trials is not None:
             news = "acts as the candidate; its trials decide"
-            if not resident.state.drives:
-                news = f"is the candidate; its trials begin when the agent runs, and it is {resident.state.value} now"
+            if not (state := resident.state).drives:
+                news = f"is the candidate; {self._rests(state, 'Its trials begin')}"
             resident.send(RequestProgress(ask.number, news))
             self._wait_for_outcome(choice, ask.number)
         status = resident.status()
@@ -257,17 +261,23 @@ class Succession:
     def _wait_for_outcome(self, choice: Choice, number: int) -> None:
         """Wait for the end of the trials; meanwhile, say why they rest, and that they go on."""
         resident, end = self._resident, time.monotonic() + _TRIAL_TIMEOUT
-        told = resident.state
+        told, goes = resident.state, "begin"
         while not choice.outcome.wait(_STATE_POLL_PERIOD):
-            state, why = resident.state, resident.why
+            state, goes = resident.state, "go on" if told.drives else goes
             if state.drives and not told.drives:
-                resident.send(RequestProgress(number, "the trials go on"))
+                resident.send(RequestProgress(number, f"the trials {goes}"))
             elif state is not told and state in _ONCE and not choice.result:
-                text = f"{state.value}: {why.rstrip('.')}. The trials go on once {_ONCE[state]}"
-                resident.send(RequestProgress(number, text))
+                resident.send(RequestProgress(number, self._rests(state, f"The trials {goes}")))
             told = state
             if time.monotonic() > end:
                 raise RequestRefused("the trial did not end in a day")
+
+    def _rests(self, state: State, what: str) -> str:
+        """Why, and since when, the policy does not drive in this `state`, and what ends it: then, `what` happens."""
+        resident = self._resident
+        since = time.strftime("%H:%M:%S", time.localtime(resident.since))
+        text = f"the agent is {state.value} since {since}: {resident.why.rstrip('.')}"
+        return f"{text}. {what} once {_ONCE[state]}"
 
     def _made(self, version: Version, ask: Ask, session: RobotSession) -> Choice:
         resident, digest = self._resident, version.digest

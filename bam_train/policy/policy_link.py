@@ -45,7 +45,8 @@ class PolicyLink:
         except LinkLost as error:
             raise self._lost(error) from error
         if not isinstance(spec.action_space, spaces.Dict):
-            raise PolicyError(f"{self}: it serves {spec.env_id}, and no policy. {self._start}")
+            what = f"that is the environment {spec.env_id}, and no policy server"
+            raise PolicyError(f"{self}: {what}; give its address as --robot or --transport. {self._start}")
         arrays: dict[str, Any] = spec.action_space.spaces
         self.inputs = {name: Tensor((1, *box.shape), box.dtype.name) for name, box in arrays.items()}
         self.outputs = ["action"]
@@ -92,6 +93,7 @@ class PolicyLink:
         for flag in ("--token-file", "--ca-file"):  # those of bam-deploy are the robot's
             reason = reason.replace(flag, f"--policy{flag[1:]}")
         reason += ")" * (reason.count("(") - reason.count(")"))
+        reason = reason.replace("and no environment", "and no policy server")
         if isinstance(error, NoServer):
             remedy = "" if "--policy-" in reason else f" {self._start}"
             return NoServer(str(self), f"{reason}{'' if reason.endswith('?') else '.'}{remedy}")

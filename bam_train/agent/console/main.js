@@ -191,7 +191,7 @@ for (const name of ["keydown", "keyup"]) {
   }, { capture: true });
 }
 
-for (const op of ["pause", "resume"]) byId(op).onclick = () => order(op, { why: "console" });
+for (const op of ["pause", "resume"]) byId(op).onclick = () => order(op);
 for (const [id, resume] of [["back-run", true], ["back-pause", false]]) {
   byId(id).onclick = () => {
     endDriving();
@@ -210,7 +210,8 @@ byId("take").onclick = async () => {
   enable();
 };
 byId("roll-back").onclick = async () => {
-  if (await ask("Roll back to the previous version?")) await order("rollback", { why: "console" });
+  const { active, names: { champion } = {} } = status, target = champion && champion !== active ? "champion" : "version before";
+  if (await ask(`Roll back to the ${target}?`)) await order("rollback");
   look();
 };
 

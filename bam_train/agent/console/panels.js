@@ -60,14 +60,14 @@ function showRun(status) {
     "Episodes": `${status.episodes ?? 0}, step ${status.steps ?? 0} of this one`,
     "Link latency": ms(status.link_ms),
     "Loop latency": `${ms(status.loop_ms)} of ${ms(status.period == null ? null : 1000 * status.period)}`,
-    "Late ticks": `${status.late ?? 0} of ${status.ticks ?? 0}`,
+    "Late ticks": `${status.late ?? 0} of ${status.ticks ?? 0}${status.slow ? `, ${status.slow} because of the policy` : ""}`,
     "In this state for": status.since ? duration(Date.now() / 1000 - status.since) : "-",
     "Recording": status.recording ?? "none",
     "Software": status.agent ? `bam-train ${status.agent}` : "-",
   };
   byId("run").replaceChildren(...Object.entries(facts).flatMap(([name, text]) => [element("dt", name), element("dd", text)]));
   const signs = recent.map((one) => (one === null ? "·" : one ? "✓" : "✗")).join(" ");
-  say("recent", recent.length ? `Oldest to newest: ${signs}  (✓ success, ✗ none, · not judged)` : "");
+  say("recent", recent.length ? `Oldest to newest: ${signs}  (✓ success, ✗ no success, · not judged)` : "");
 }
 
 function showGuardTable(guards) {
@@ -75,7 +75,7 @@ function showGuardTable(guards) {
     const limit = row.limit == null ? "off" : `${Number(row.limit.toPrecision(3))} ${row.unit}`;
     return [`${name} (${row.number})`, limit, row.altered, row.held, row.stopped];
   });
-  rows(byId("guard-table"), ["guard", "limit", "altered", "held", "stopped"], lines);
+  rows(byId("guard-table"), ["Guard", "Limit", "Altered", "Held", "Stopped"], lines);
 }
 
 // Bars: how near the guards are that the newest state can be compared with, the nearest first.
@@ -112,7 +112,7 @@ export function showVersions(versions, status) {
   const lines = versions.map(({ digest, names, added, env, algorithm }) => [
     digest === status.active ? "▶ acts" : "", names?.join(", ") || "-", short(digest), time(added), env ?? "-", algorithm ?? "-",
   ]);
-  rows(byId("versions"), ["", "names", "digest", "added", "environment", "algorithm"], lines);
+  rows(byId("versions"), ["", "Names", "Digest", "Added", "Environment", "Algorithm"], lines);
 }
 
 const time = (value) => {

@@ -19,6 +19,7 @@ from collections.abc import Callable, Coroutine, Mapping
 from concurrent.futures import CancelledError, Future, wait
 from concurrent.futures import TimeoutError as NoResult
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,7 +31,7 @@ from bam_envs.core.errors import BamEnvsError, LinkLost, NoServer
 from bam_envs.core.location import Credentials
 from bam_envs.core.wording import brief
 from bam_envs.rosbridge.bus import tell
-from bam_envs.rosbridge.dialing import AGENT_PORT, http_refusal, no_connection, open_port, silent
+from bam_envs.rosbridge.dialing import AGENT_PORT, http_refusal, no_connection, no_websocket, open_port, silent
 from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.threads import LoopThread
 from bam_train.agent.remote.agent_protocol import CHUNK, PATH, PROTOCOL, Stage, When
@@ -51,6 +52,7 @@ REFUSED = 3
 _LARGEST = 64 * 2**20
 _SILENT_SERVER_TIMEOUT = 1.0  # time after which a silent server is asked whether it is one of rosbridge [s]
 _PING, _PONG = 5.0, 20.0  # time between two pings, and longest time for their answer [s]
+_RECOGNITION_TIMEOUT = 2.0  # longest wait until another server says what it is [s]
 _CLOSE = 1.0  # longest time for a closing handshake [s]
 _ENDED_POLL_PERIOD = 0.5  # time between two looks whether the network thread has ended [s]
 _IS_IT_ROSBRIDGE = '{"op": "call_service", "service": "/rosapi/get_time", "id": "agent?"}'
@@ -102,8 +104,20 @@ class AgentClient:
         Raises:
             NoServer: There is no agent, or none that this version can talk to; the text gives the reason.
         """
-        self._thread.start(self._main)
+        try:
+            self._thread.start(self._main)
+        except NoServer as error:
+            if str(error).endswith(_NO_AGENT) and (other := self._other()):
+                raise NoServer(self.url, other) from error
+            raise
         return self
+
+    def _other(self) -> str:
+        """What answers at the address instead of an agent, if it tells."""
+        from bam_envs.live.bringup import what_answers_at
+
+        endpoint = replace(self._endpoint, connect_timeout=min(self.timeout, _RECOGNITION_TIMEOUT))
+        return what_answers_at(endpoint, "live agent")
 
     def close(self) -> None:
         """Close the connection. Idempotent."""
@@ -302,8 +316,7 @@ class AgentClient:
         except ValueError as error:  # a redirect, which leads to another server than the one that was meant
             raise NoServer(address.url, f"a web server answers there: {error}. Is it the right port?") from error
         except WebSocketException as error:
-            text = f"something listens there that is no WebSocket server ({error.__cause__ or error})."
-            raise NoServer(address.url, f"{text} If it has TLS, use wss://.") from error
+            raise NoServer(address.url, no_websocket(error.__cause__ or error)) from error
 
     async def _hello(self, socket: ClientConnection) -> Any:
         first = asyncio.ensure_future(socket.recv())

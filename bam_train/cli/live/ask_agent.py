@@ -97,7 +97,8 @@ def status_lines(status: Mapping[str, Any]) -> Iterator[str]:
         yield f"  owner     {owner}{'' if left is None else f', {left:.0f} s left'}"
     if get("episodes") is not None:
         recent = [one for one in get("recent") or () if one is not None]
-        yield f"  episodes  {get('episodes')}, {get('successes')} succeeded; {sum(recent)} of the last {len(recent)}"
+        last = f"; {sum(recent)} of the last {len(recent)}" if recent else ""
+        yield f"  episodes  {get('episodes')}, {get('successes')} succeeded{last}"
     if trial := get("trial"):
         yield f"  trial     {trial['done']} of {trial['needed']}: {trial['text']}"
     if get("ticks") is not None:

@@ -22,7 +22,9 @@ CLOSEST = 0.96
 RECENT = 20
 """Number of the last ticks that show whether the computer is busy."""
 BUSY = 0.05
-"""Share of these that may be disturbed."""
+"""Share of these that may be disturbed, and of the ticks of a policy that may be late."""
+WINDOW = 100
+"""Fewest ticks that show that a policy is late too often."""
 _LATE_BY, _JITTER = 0.1, 0.005
 """A tick is disturbed if it starts this share of a period too late; at least the lateness of a sleeping process [s]."""
 
@@ -153,9 +155,14 @@ class Pacer:
         return Lateness(float(p50), float(p99), self._latest)
 
 
+def least_lateness(period: float) -> float:
+    """The delay from which on a tick counts as late, for a `period` [s]."""
+    return max(_LATE_BY * period, _JITTER)
+
+
 def is_disturbed(late: float, period: float) -> bool:
     """Whether a tick that began `late` [s] after its deadline shows that the computer was busy; `period` is in s."""
-    return late > max(_LATE_BY * period, _JITTER)
+    return late > least_lateness(period)
 
 
 class TickTimes:
@@ -173,6 +180,7 @@ class TickTimes:
         self.period = period
         self.late = self.slow = 0
         """Ticks that missed a deadline, and how many of these the policy made late."""
+        self._missed: deque[bool] = deque(maxlen=WINDOW)  # whether each of the last ticks missed a deadline
         self._disturbed: deque[bool] = deque(maxlen=RECENT)
         self._computed: deque[float] = deque(maxlen=RECENT)
 
@@ -186,6 +194,7 @@ class TickTimes:
             computed: CPU time of that action [s].
         """
         self.late += missed > 0
+        self._missed.append(missed > 0)
         if self.period is None:
             return False
         self._computed.append(computed)
@@ -193,6 +202,16 @@ class TickTimes:
         self._disturbed.append(is_disturbed(late, self.period) and not is_policy)
         self.slow += (is_slow := missed > 0 and is_policy)
         return is_slow
+
+    @property
+    def warning(self) -> str:
+        """That more of the last ticks were late than may be of those of a trial; "" if not."""
+        late, seen = sum(self._missed), len(self._missed)
+        if seen < WINDOW or late <= BUSY * seen:
+            return ""
+        late_ones = f"{late} of the last {seen} ticks missed their deadline"
+        so_far = f"{self.late} so far, {self.slow} of them because of the policy"
+        return f"{late_ones} ({so_far}): {'use a faster policy' if 2 * self.slow > self.late else 'end other programs'}"
 
     @property
     def computed(self) -> float:

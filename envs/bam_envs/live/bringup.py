@@ -1,25 +1,32 @@
 """Connect a live robot: read its description, check its topics and its readiness, and open a session.
 
 A rosbridge server does not report a wrong topic or type. Each topic is therefore checked by its type, if the server
-offers rosapi, and each source by its first message.
+offers rosapi, and each source by its first message. Where another server or another robot answers, it is named.
+
+Longer than most files: all that a client learns of a server before it may move the robot there.
 """
 
 import math
 import threading
 import time
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, suppress
 from functools import partial
 from typing import Any
 
+from bam_envs.arms.description import ArmDescription
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady, ProtocolError, RemoteError, StaleState
+from bam_envs.core.robot import RobotSpec
+from bam_envs.core.robot_models import known_models, read_description
 from bam_envs.core.timing import Deadline
 from bam_envs.live.state import LiveState, Mailbox
-from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, has_room, read_info
+from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, has_room, not_wanted, read_info
 from bam_envs.ros.freshness import Tagger, read_tag
 from bam_envs.ros.messages import bare_type, same_type, tag_text
 from bam_envs.ros.profile_tables import Enable, Readiness, RobotProfile, Sink
 from bam_envs.rosbridge.bus import Caller, Message, namespaces_with
+from bam_envs.rosbridge.client import RosbridgeLink
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.ros_bus import RosBus, bare_reason
 from bam_envs.rosbridge.sessions import LEASE_TOPIC, LEAVE, RENEW, SESSION_SERVICE, is_forbidden, read_session
 
@@ -39,6 +46,9 @@ _RENEW_EVERY, _RENEWAL_LIFE = 0.5, 1.0
 (`CommandLease`)."""
 _STATES = 5
 """Number of states of a topic that should arrive per period, and within the age at which a state is too old."""
+_JOINT_STATES = "sensor_msgs/JointState"
+_NAMED_WITHIN, _OTHERS_WITHIN = 2.0, 0.2
+"""Longest wait for the names of joints, and for those of the other publishers on a topic [s]."""
 _ACTIVE = ("active", "running")
 """The states of a controller that takes commands, in ROS 2 and in ROS 1."""
 
@@ -382,3 +392,66 @@ class DrivingSession:
         text = f"{word} {self.tagger.sign(tag, LEASE_TOPIC, word.encode())}"
         with suppress(BamEnvsError):  # a link that is down is reported by the next command
             link.publish(link.namespace + LEASE_TOPIC, {"data": text})
+
+
+# ---- another server, or another robot
+
+
+def what_answers(link: RosBus, wanted: str) -> str:
+    """What the server of a link is instead of the `wanted` one, in a sentence; empty if it does not tell."""
+    with suppress(BamEnvsError):
+        answer = ask(link, link.namespace + INFO_SERVICE)
+        return "" if answer is None else not_wanted(answer.get("message"), wanted)
+    return ""
+
+
+def what_answers_at(endpoint: Endpoint, wanted: str) -> str:
+    """As `what_answers`, of the server at an address, to which nothing is connected yet."""
+    with suppress(BamEnvsError), closing(RosbridgeLink(endpoint, name="recognition")) as link:
+        link.connect()
+        return what_answers(link, wanted)
+    return ""
+
+
+def another_robot(link: RosBus, spec: RobotSpec) -> str:
+    """Which described arm the robot of a link is, in a sentence, if it lacks joints of the arm of `spec`; else empty.
+
+    It is known by the names of its joints.
+    """
+    ours = _joints(spec.command.labels, spec.command.units)
+    there = set(_measured_joints(link)) if ours else set()
+    if not there or set(ours) <= there:
+        return ""
+    arms = (read_description(path) for path in known_models(ArmDescription).values())
+    found = {arm.name: arm.joint_names for arm in arms if isinstance(arm, ArmDescription)}
+    fits = {name: joints for name, joints in found.items() if set(joints) <= there}
+    most = max(map(len, fits.values()), default=0)
+    names = sorted(name for name, joints in fits.items() if len(joints) == most)
+    if not names:
+        return ""
+    return (
+        f"this is another robot: joints {', '.join(fits[names[0]])}, and {spec.name} has {', '.join(ours)}. If it is "
+        f"the right address, choose --robot-model {' or '.join(names)}, or a checkpoint for it."
+    )
+
+
+def _joints(labels: tuple[str, ...], units: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(label for label, unit in zip(labels, units, strict=True) if unit == "rad")
+
+
+def _measured_joints(link: RosBus) -> Iterator[str]:
+    """The joints in the next messages of joint states in the namespace of a link, whatever their topics."""
+    with suppress(BamEnvsError):  # a server without rosapi
+        answer = link.call("/rosapi/topics", "rosapi/Topics", {}, _NAMED_WITHIN)
+        rows = zip(answer.get("topics") or (), answer.get("types") or (), strict=False)
+        topics = {str(topic) for topic, kind in rows if same_type(str(kind), _JOINT_STATES)}
+        topics = {topic for topic in topics if topic.startswith(f"{link.namespace}/")}
+        inbox = Mailbox(keeps_all=True)
+        ends = [link.subscribe(topic, _JOINT_STATES, inbox.listener(topic)) for topic in sorted(topics)]
+        inbox.wait_for(lambda slots: topics <= slots.keys() or not link.is_up, _NAMED_WITHIN)
+        inbox.wait_for(lambda slots: False, _OTHERS_WITHIN)
+        for end in ends:
+            end()
+        for message in (letter.message for topic in topics for letter in tuple(inbox.letters[topic])):
+            names = message.get("name") if isinstance(message, Mapping) else None
+            yield from map(str, names if isinstance(names, list) else ())

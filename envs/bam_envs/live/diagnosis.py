@@ -6,7 +6,7 @@ Each step needs the steps before it, so that the first failure ends the diagnosi
 import asyncio
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -104,7 +104,8 @@ class Diagnosis:
             try:
                 findings = step()
             except BamEnvsError as error:
-                yield DiagnosisStep(name, "failed", str(error))
+                other = "" if self.robot is None else bringup.another_robot(self._link, self.robot.spec)
+                yield DiagnosisStep(name, "failed", other or str(error))
                 return
             if findings is None:
                 continue
@@ -172,7 +173,7 @@ class Diagnosis:
                     f"there is no topic {link.namespace}{topic} ({kind}), which has {signals}. Does its driver "
                     f"run, and is its name right? Topics are in the profile of {profile.name} "
                     "(--profile); with --checkpoint only those of its task are needed."
-                    f"{namespaces_with(link, 'topics', topic, topics)}{self._another_robot(profile)}"
+                    f"{namespaces_with(link, 'topics', topic, topics)}{self._another_kind(profile)}"
                 )
         found = [f"profile {profile.name}: {', '.join(topics)}"]
         if types.answers:
@@ -203,7 +204,7 @@ class Diagnosis:
         best = max((load_profile(name) for name in ("ur5e", *shipped_profiles())), key=shares)
         return best, shares(best)[0]
 
-    def _another_robot(self, profile: RobotProfile) -> str:
+    def _another_kind(self, profile: RobotProfile) -> str:
         """A sentence for an error, if an arm is where `profile` has a base, or a base where it has an arm."""
         best, share = self._best_profile()
         if best.kind == profile.kind or not share:
@@ -221,16 +222,15 @@ class Diagnosis:
         )
         if inspection.is_lockstep:
             return ["its time advances with commands only, so that states have neither rate nor age"], []
-        found, warnings, seen = list[str](), list[str](), set()
+        rates, warnings = dict[str, dict[str, str]](), list[str]()  # of a topic: those of each of its publishers
         for signal in robot.spec.signals:
             reading = inspection.readings[signal.name]
-            key = (reading.source.topic, reading.source.names)
             limit = max(reading.source.max_age or 0.0, profile.max_age)
             _require_states(reading, limit, seconds, inspection, here=is_loopback(self.endpoint.address.host))
-            if key not in seen:
-                found.append(f"{reading.source.topic} {reading.rate:.4g} Hz, age {_p50_p99(reading.ages)}")
-                warnings += _warnings_about(reading, limit, period)
-            seen.add(key)
+            text = f"{reading.rate:.4g} Hz, age {_p50_p99(reading.ages)}"
+            rates.setdefault(reading.source.topic, {}).setdefault(text, signal.name)
+            warnings += (one for one in _warnings_about(reading, limit, period) if one not in warnings)
+        found = [f"{topic} {_publishers(texts)}" for topic, texts in rates.items()]
         if inspection.busy:
             warnings.append(f"{inspection.busy}; close other programs, or the robot will be held")
         return found, warnings
@@ -367,6 +367,13 @@ def _why_old(reading: Reading, limit: float, inspection: Inspection, *, here: bo
         "and is to be set by the same NTP server as that of the bridge's; or driver or bridge are short of time: give "
         "the bridge a core of its own, and send no raw images through it."
     )
+
+
+def _publishers(rates: Mapping[str, str]) -> str:
+    """The rates on one topic; of several publishers each with the first signal of its messages."""
+    if len(rates) == 1:
+        return next(iter(rates))
+    return " and ".join(f"{text} ({signal})" for text, signal in rates.items())
 
 
 def _warnings_about(reading: Reading, limit: float, period: float) -> Iterator[str]:

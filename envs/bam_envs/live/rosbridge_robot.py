@@ -24,6 +24,7 @@ from bam_envs.core.errors import (
     LinkLost,
     NotInCommand,
     NotReady,
+    ProtocolError,
     RemoteError,
     ResetNeeded,
     SafetyStop,
@@ -178,13 +179,19 @@ class RosbridgeRobot:
             for camera, _ in self._cameras.values():
                 camera.connect()
             self._control, self._halting = control, halting
-        except BaseException:
-            for camera, _ in self._cameras.values():
-                camera.close()
-            goals, self._goals = self._goals, None
-            for link in (halting, control, *([] if goals is None else [goals.link])):
-                link.close()
-            raise
+        except BaseException as error:
+            try:
+                if isinstance(error, ProtocolError | StaleState) and (
+                    other := bringup.another_robot(control, self.spec)
+                ):
+                    raise ProtocolError(f"{self.url}: {other}") from error
+                raise
+            finally:
+                for camera, _ in self._cameras.values():
+                    camera.close()
+                goals, self._goals = self._goals, None
+                for link in (halting, control, *([] if goals is None else [goals.link])):
+                    link.close()
         close_at_exit(self)
 
     def _control_link(self) -> RosBus:

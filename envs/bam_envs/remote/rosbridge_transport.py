@@ -248,7 +248,10 @@ class RosbridgeTransport:
         remedy = f"Start one: bam-serve --env {self.env_id or 'bam/pick'}{namespace}"
         if "does not exist" in reason:  # the text of all bridges but one
             elsewhere = namespaces_with(self._link, "services", service_name(""))
-            raise NoServer(self.url, f"{self._robot_there() or f'{reason}.'}{elsewhere} {remedy}")
+            from bam_envs.live.bringup import what_answers
+
+            other = what_answers(self._link, "environment")
+            raise NoServer(self.url, f"{other or f'{reason}.'}{elsewhere} {remedy}")
         try:
             return self._rack()
         except UnknownName as error:
@@ -257,17 +260,6 @@ class RosbridgeTransport:
                 f"{self._where()}: {reason.rstrip('.')}; give observation_space and action_space, or an env_id that is "
                 f"registered here. {remedy}",
             ) from error
-
-    def _robot_there(self) -> str:
-        """A sentence, if a robot without an environment is served there, such as that of a live agent."""
-        from bam_envs.live.bringup import robot_info
-
-        try:
-            info = robot_info(self._link)
-        except (LinkLost, ProtocolError, RemoteError):
-            return ""
-        what = "" if info is None else f"a live agent, and the robot {info.name}" if info.agent else "a robot"
-        return what and f"{what} {'are' if ',' in what else 'is'} there, and no environment. --robot takes its address."
 
     def _where(self) -> str:
         return service_name(self._link.namespace) if self.channel == "service" else f"{self._base}/request"

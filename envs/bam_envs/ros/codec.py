@@ -81,18 +81,41 @@ def read_info(text: object, where: str) -> RobotInfo:
     Raises:
         ProtocolError: Something without a robot is served there, or it is no description.
     """
+    data = _table_in(text)
+    if isinstance(data.get(SERVES), str):
+        raise ProtocolError(f"{where}: {not_wanted(text, 'robot')}")
+    if not isinstance(data.get("name"), str):
+        raise ProtocolError(f"{where}: the answer must describe the robot, not {brief(text)}.")
+    known = {key: data[key] for key in RobotInfo.__dataclass_fields__ if key in data}
+    return read_table(RobotInfo, known, where, ProtocolError)
+
+
+def not_wanted(text: object, wanted: str) -> str:
+    """What a server is by its answer of `INFO_SERVICE`, instead of the one that was `wanted`, and what takes it.
+
+    Empty if the answer does not tell.
+    """
+    data = _table_in(text)
+    served, name = data.get(SERVES), data.get("name")
+    if served == A_POLICY:
+        what, use = "a policy server", "give its address as --policy-server"
+    elif isinstance(served, str):
+        what, use = f"the environment {brief(served)}", "give its address as --transport"
+    elif data.get("agent"):
+        what, use = f"a live agent (bam-agent) with {name}", "push to it with bam-push; --robot takes over from it"
+    elif isinstance(name, str):
+        what, use = f"the robot {name}", "give its address as --robot"
+    else:
+        return ""
+    return f"that is {what}, and no {wanted}; {use}."
+
+
+def _table_in(text: object) -> dict[str, Any]:
     try:
         data = json.loads(text) if isinstance(text, str) else None
     except ValueError:
         data = None
-    if isinstance(data, dict) and isinstance(served := data.get(SERVES), str):
-        if served == A_POLICY:
-            raise ProtocolError(f"{where}: that is a policy server, and no robot; give its address as --policy-server.")
-        raise ProtocolError(f"{where}: {brief(served)} is served there, and no robot; give its address as --transport.")
-    if not isinstance(data, dict) or not isinstance(data.get("name"), str):
-        raise ProtocolError(f"{where}: the answer must describe the robot, not {brief(text)}.")
-    known = {key: data[key] for key in RobotInfo.__dataclass_fields__ if key in data}
-    return read_table(RobotInfo, known, where, ProtocolError)
+    return data if isinstance(data, dict) else {}
 
 
 def decode_source(source: Source, message: object, size: int) -> Array:

@@ -20,7 +20,7 @@ from roslibpy.event_emitter import EventEmitterMixin
 
 from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer, ProtocolError
 from bam_envs.rosbridge.bus import tell
-from bam_envs.rosbridge.dialing import http_refusal, no_connection, open_port, silent
+from bam_envs.rosbridge.dialing import http_refusal, no_connection, no_websocket, open_port, silent
 from bam_envs.rosbridge.encoding import Fragments, decode_server_frame, dump_json
 from bam_envs.rosbridge.endpoint import Address, Endpoint
 from bam_envs.rosbridge.ros_bus import bare_reason
@@ -314,4 +314,4 @@ def _no_websocket(address: Address, connection: Connection, timeout: float) -> s
     reason = connection.wasNotCleanReason if status else "connection closed while reading HTTP status line"
     if end and not status:
         reason = f"unsupported protocol; expected HTTP/1.1: {line[:100].decode(errors='replace')}"
-    return f"something listens there that is no WebSocket server ({reason}). If it has TLS, use wss://."
+    return no_websocket(reason)

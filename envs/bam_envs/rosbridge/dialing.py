@@ -5,7 +5,7 @@ import socket
 import ssl
 
 from bam_envs.core.errors import NoServer
-from bam_envs.core.location import LiveRobot
+from bam_envs.core.location import LiveRobot, is_loopback
 from bam_envs.rosbridge.endpoint import Address
 
 _HOST_MISMATCH = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
@@ -78,7 +78,7 @@ def no_connection(
         example = " In examples it stands for the robot's computer." if address.host in ("robot", "gpu") else ""
         return f"the name {address.host!r} is not known: {error.strerror}. Try the IP address.{example}"
     if isinstance(error, ConnectionRefusedError):
-        here = f"Start one with `{stand_in} --port {address.port}` or `{_LAUNCH}`."
+        here = f"Start one with `{stand_in} --port {address.port}` or `{_launch(address)}`."
         if address.port == AGENT_PORT:
             start = start or f"{AGENT_PORT} is the port of bam-agent: does it run there? {here}"
         return f"refused: nothing listens there. Is the port open? {start or here}"
@@ -88,11 +88,23 @@ def no_connection(
     return f"cannot be reached: {error.strerror or error}."
 
 
+def _launch(address: Address) -> str:
+    """The command that starts a rosbridge server there; one for this computer listens to nobody else."""
+    near = f" address:={'127.0.0.1' if address.host == 'localhost' else address.host}"
+    return f"{_LAUNCH} port:={address.port}{near if is_loopback(address.host) else ''}"
+
+
 def silent(address: Address, timeout: float) -> str:
     """The reason why there is no WebSocket where a port is open that did not answer within `timeout` [s]."""
     hint = " Does it speak TLS? If not, use ws://." if address.secure else ""
     text = f"the port is open, and what listens there is silent for {timeout:.1f} s. Is it a rosbridge server?"
     return f"{text}{hint}"
+
+
+def no_websocket(reason: object) -> str:
+    """The text about a server that sent something else than the answer to a WebSocket's opening handshake."""
+    hint = "If it has TLS, use wss://; if it is the port of bam-serve --tcp, tcp://."
+    return f"something listens there that is no WebSocket server ({reason}). {hint}"
 
 
 def http_refusal(status: int, body: bytes) -> str:

@@ -6,6 +6,7 @@ Some of them warn before they stop the robot: their `warning` is set until its c
 from collections import deque
 
 from bam_envs.core.robot import RobotSpec
+from bam_envs.core.timing import least_lateness
 from bam_envs.safety.arm_guards import fastest_joints, shorten
 from bam_envs.safety.guard import Guard, Limits, Tick, clip, columns_in, is_base
 
@@ -13,10 +14,6 @@ TICKS = 100
 """Number of recent ticks of which shares are computed."""
 LATE_TICKS = 10
 """Number of consecutive late commands that stop the robot."""
-_LATE_BY = 0.1
-"""A tick is late if it comes more than this share of a period after its time; at least `_JITTER`."""
-_JITTER = 0.005
-"""Lateness of a sleeping process on an idle computer [s]."""
 
 
 class ActionAge(Guard):
@@ -88,7 +85,7 @@ class LateTicks(Share):
     def __init__(self, spec: RobotSpec, limits: Limits) -> None:
         super().__init__()
         self.limit_value, self._period = limits.late_share, spec.period
-        self._by = max(_LATE_BY * spec.period, _JITTER)
+        self._by = least_lateness(spec.period)
 
     def is_counted(self, tick: Tick) -> bool:
         """Whether the command is late."""

@@ -154,7 +154,8 @@ class ScriptedRobot:
 
     def start(self):
         if "joint_position" in self.signals:
-            known = {"joint_position": HOME, "gripper_width": 0.085, "object_quaternion": [1.0, 0.0, 0.0, 0.0]}
+            home = np.resize(HOME, self.signals["joint_position"].shape)
+            known = {"joint_position": home, "gripper_width": 0.085, "object_quaternion": [1.0, 0.0, 0.0, 0.0]}
             for name in known.keys() & self.signals.keys():
                 self.signals[name][:] = known[name]
         for source in self.profile.state:

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from websockets.asyncio.server import serve
 
-from bam_envs.core.errors import InvalidValue
+from bam_envs.core.errors import InvalidValue, ProtocolError
+from bam_envs.core.kinematics import UR_JOINTS
 from bam_envs.core.location import LiveRobot
 from bam_envs.core.timing import Pacer
 from bam_envs.live import bringup, examination
+from bam_envs.live.building import live_robot
 from bam_envs.live.diagnosis import STEPS, Diagnosis
 from bam_envs.live.examination import Reading, measured_link
 from bam_envs.robots.profile import load_profile
@@ -172,6 +174,29 @@ def test_another_robot_than_the_profile_says(server, robot_on):
     assert why.startswith(
         "there is no topic /joint_states (sensor_msgs/JointState), which has joint_position, joint_velocity."
     )
+
+
+@pytest.mark.parametrize("tells", [True, False])
+def test_another_arm_than_the_profile_says_is_named_by_its_joints(server, robot_on, tells):
+    robot_on(server, "ros2_so_arm100", info=RobotInfo("ros2_so_arm100") if tells else None)
+    other = (
+        "this is another robot: joints shoulder_pan, shoulder_lift, elbow_flex, wrist_flex, wrist_roll, and {} has {}. "
+        "If it is the right address, choose --robot-model so101, or a checkpoint for it."
+    )
+    sevenfold = other.format("xarm_ros2", ", ".join(f"joint{number}" for number in range(1, 8)))
+    assert failure(diagnose(server.url, profile="xarm_ros2")[1]) == ("topics", sevenfold)
+    with pytest.raises(ProtocolError) as error:  # as a program that moves it
+        live_robot(server.url, profile="ur5e").connect()
+    assert str(error.value) == f"{server.url}: {other.format('ur5e', ', '.join(UR_JOINTS))}"
+
+
+def test_the_publishers_on_a_topic_are_one_line(server, robot_on):
+    robot = robot_on(server, "xarm_ros2")
+    found = diagnose(server.url, profile="xarm_ros2")[1]["rates and ages"].found
+    rate = r"[\d.]+ Hz, age p50 [^;]+ ms, p99 [^;]+ ms"
+    shared = rf"/xarm/joint_states {rate} \(joint_position\) and {rate} \(gripper_width\)"
+    assert re.fullmatch(rf"{shared}; /object_pose {rate}", found), found
+    assert robot.commands == []
 
 
 def test_a_topic_of_another_type(server, robot_on):

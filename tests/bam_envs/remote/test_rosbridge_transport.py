@@ -154,14 +154,18 @@ def test_an_environment_that_is_not_there(served, open_to, channel):
 
 @pytest.mark.parametrize(
     ("agent", "text"),
-    [(True, "a live agent, and the robot ur5e are there"), (False, "a robot is there")],
+    [
+        (True, "a live agent (bam-agent) with ur5e, and no environment; push to it with bam-push; --robot takes over"),
+        (False, "the robot ur5e, and no environment; give its address as --robot."),
+    ],
 )
 def test_a_robot_without_an_environment_is_named(server, open_to, agent, text):
     info = RobotInfo("ur5e", agent=agent).to_json()
     server.serve(f"/bam_002{INFO_SERVICE}", "std_srvs/Trigger", lambda *_: {"success": True, "message": info})
     with pytest.raises(NoServer) as error:
         open_to("bam_002").connect()
-    assert f": {text}, and no environment. --robot takes its address. Start one: bam-serve" in str(error.value)
+    assert f"/bam_002: that is {text}" in str(error.value)
+    assert " Start one: bam-serve" in str(error.value)
 
 
 def test_nothing_is_served_in_that_namespace(server, served, open_to):

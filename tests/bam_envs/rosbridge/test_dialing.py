@@ -13,6 +13,8 @@ from bam_envs.rosbridge.client import RosbridgeLink
 from bam_envs.rosbridge.dialing import AGENT_PORT, no_connection
 from bam_envs.rosbridge.endpoint import Address, Endpoint
 
+TLS = "If it has TLS, use wss://; if it is the port of bam-serve --tcp, tcp://."
+
 
 @contextmanager
 def answering(answer=None):
@@ -51,8 +53,21 @@ def test_refused(free_port):
     assert failure(f"ws://127.0.0.1:{free_port}") == (
         "refused: nothing listens there. Is the port open? "
         f"Start one with `bam-serve --env bam/pick --port {free_port}` "
-        "or `ros2 launch rosbridge_server rosbridge_websocket_launch.xml`."
+        f"or `ros2 launch rosbridge_server rosbridge_websocket_launch.xml port:={free_port} address:=127.0.0.1`."
     )
+
+
+@pytest.mark.parametrize(
+    ("url", "flags"),
+    [
+        ("ws://localhost", "port:=9090 address:=127.0.0.1"),
+        ("ws://[::1]:9091", "port:=9091 address:=::1"),
+        ("ws://10.0.0.5", "port:=9090"),
+    ],
+)
+def test_what_is_started_for_this_computer_listens_to_nobody_else(url, flags):
+    text = no_connection(Endpoint(url).address, ConnectionRefusedError(), 1.0)
+    assert text.endswith(f"`ros2 launch rosbridge_server rosbridge_websocket_launch.xml {flags}`.")
 
 
 def test_refused_at_the_port_of_live_agents():
@@ -89,12 +104,12 @@ def test_a_name_that_nobody_knows():
         (
             b"220 mail.example.org ESMTP\r\n\r\n",
             "something listens there that is no WebSocket server "
-            "(unsupported protocol; expected HTTP/1.1: 220 mail.example.org ESMTP). If it has TLS, use wss://.",
+            f"(unsupported protocol; expected HTTP/1.1: 220 mail.example.org ESMTP). {TLS}",
         ),
         (
             b"\x15\x03\x03\x00\x02\x02\x0a",
             "something listens there that is no WebSocket server "
-            "(connection closed while reading HTTP status line). If it has TLS, use wss://.",
+            f"(connection closed while reading HTTP status line). {TLS}",
         ),
     ],
 )
@@ -155,8 +170,7 @@ def test_tls_that_fails(new_scripted, scripted, certificates):
         "Give the file of the authority that signed it as ca_file (--ca-file)."
     )
     assert failure(url.replace("wss:", "ws:")) == (
-        "something listens there that is no WebSocket server "
-        "(connection closed while reading HTTP status line). If it has TLS, use wss://."
+        f"something listens there that is no WebSocket server (connection closed while reading HTTP status line). {TLS}"
     )
     ca_file, context = certificates("robot.example")
     assert failure(new_scripted(context=context).url, credentials=Credentials(str(ca_file))) == (

@@ -8,6 +8,7 @@ import pytest
 
 from bam_envs import __version__
 from bam_envs.core.errors import InvalidValue, LinkLost, NoServer
+from bam_envs.ros.codec import INFO_SERVICE
 from bam_envs.rosbridge.server import BridgeServer
 from bam_train.agent.remote.agent_client import AgentClient, agent_url
 from bam_train.errors import CheckpointError, RequestRefused
@@ -154,6 +155,15 @@ NO_AGENT = (
 def test_a_rosbridge_server_is_no_agent_and_where_nothing_listens_is_none():
     with BridgeServer(port=0) as server:
         assert refused(server.url) == f"{server.url}: {NO_AGENT}"
+        answers = {"success": True}
+        server.serve(INFO_SERVICE, "std_srvs/Trigger", lambda *_: answers)
+        for told, what in (
+            ({"name": "ur5e"}, "the robot ur5e, and no live agent; give its address as --robot."),
+            ({"serves": "a policy"}, "a policy server, and no live agent; give its address as --policy-server."),
+            ({"serves": "Own-v0"}, "the environment 'Own-v0', and no live agent; give its address as --transport."),
+        ):
+            answers["message"] = json.dumps(told)
+            assert refused(server.url) == f"{server.url}: that is {what}"
     text = "refused: nothing listens there. Does bam-agent run there, with this port?"
     assert refused(server.url) == f"{server.url}: {text}"
     with raising(InvalidValue, "Address 'robot:9095' has the scheme 'robot'.", begins=True):
@@ -185,4 +195,6 @@ def test_tls(new_server, tmp_path, certificates):
         assert agent.ask("status")["state"] == "paused"
     assert "the certificate is not trusted" in refused(server.url, token_file=tmp_path / "token")
     plain = server.url.replace("wss:", "ws:")
-    assert refused(plain, token_file=tmp_path / "token").endswith("If it has TLS, use wss://.")
+    assert refused(plain, token_file=tmp_path / "token").endswith(
+        " If it has TLS, use wss://; if it is the port of bam-serve --tcp, tcp://."
+    )

@@ -188,6 +188,14 @@ def test_bam_deploy_says_that_the_agent_rests_after_it(running, capsys, tmp_path
     assert capsys.readouterr().err.splitlines()[-1] == f"bam-deploy: {text}"
 
 
+def test_an_agent_does_not_drive_the_robot_of_another(running, tmp_path):
+    flags = ("--port", "0", "--folder", str(tmp_path), "--policy", str(PICK), "--robot", running.url)
+    second = subprocess.run([*PROGRAM, *flags], capture_output=True, text=True, timeout=DEADLINE)
+    text = "that is a live agent (bam-agent), and has the robot already; push to it with bam-push"
+    assert (second.returncode, second.stderr.splitlines()[-1]) == (1, f"bam-agent: {running.url}: {text}")
+    assert running.agent.ask("status")["owner"] is None
+
+
 def test_a_stop_ends_the_driving_of_a_program(running):
     env = taken(running.url)
     begun(env)

@@ -18,6 +18,7 @@ from bam_train.agent.resident import Resident
 from bam_train.agent.succession import Choice
 from bam_train.agent.versions import CANDIDATE, Versions
 from bam_train.checkpoint import Checkpoint
+from bam_train.deploy.journal import LATE as LATE_TICKS
 from bam_train.deploy.journal import Journal
 from bam_train.errors import ContractRefused
 
@@ -96,14 +97,14 @@ class Bench:
     def __init__(self, folder, *, is_running=True, connect=None, **options):
         versions = Versions(folder / "versions")
         versions.first(PICK)
-        self.faults, self.events, self._answers = deque(), [], queue.Queue()
+        self.faults, self.events, self.log, self._answers = deque(), [], [], queue.Queue()
         self._number, self._changed, self.reports, self._seen = 0, threading.Condition(), [{}], 0
         self.agent = Resident(
             AgentOptions(LiveRobot("ws://127.0.0.1:1"), folder, **options),
             versions,
             SimpleNamespace(write=self._write, fault=""),
             send=self._take,
-            tell=lambda line: None,
+            tell=self.log.append,
             admit=lambda env, lines: None,
             is_running=is_running,
             connect=connect or (lambda *arguments, **more: Session(self.agent, self.faults)),
@@ -257,6 +258,54 @@ def test_a_stop_while_a_request_is_executed_is_a_state_and_is_written_down_once(
         (State.TAKEN_OVER.value, "taken over by a program", "a program"),
         (State.STOPPED.value, why, "the agent"),
     ]
+
+
+def test_late_ticks_are_said_in_the_log_but_not_in_each_report(bench):
+    def warned():
+        return [line for line in running.log if line.startswith("warning: ")]
+
+    with bench() as running:
+        running.state(State.RUNNING)
+        session = running.agent.session
+        for tick in [IN_TIME] * 94 + [LATE] * 4 + [SLOW] * 2:
+            session.deployment.times.add(*tick)
+        session.deployment.journal.warn(["link quality (G16): only 93 of the last 100 ticks"])
+        running.ask("pause")
+        late = "6 of the last 100 ticks missed their deadline (6 so far, 2 of them because of the policy)"
+        late = f"late ticks: {late}: end other programs"
+        assert running.status["warnings"] == ["link quality (G16): only 93 of the last 100 ticks", late]
+        assert warned() == [f"warning: {one}" for one in running.status["warnings"]]
+        session.deployment.times.add(*LATE)
+        running.ask("resume")
+        running.ask("pause")
+        assert running.status["warnings"][1] == late.replace("6 of the last", "7 of the last").replace("(6", "(7")
+        assert len(warned()) == 2
+        session.deployment.journal.warn([f"{LATE_TICKS}: 7 of the last 100 commands were late"])  # says the same
+        running.ask("resume")
+        assert [one.partition(":")[0] for one in running.status["warnings"]] == ["link quality (G16)", LATE_TICKS]
+
+
+def test_what_the_front_process_logs_is_not_logged_twice(bench):
+    with bench() as running:
+        running.state(State.RUNNING)
+        refusal = running.ask("use", version="ffff").error
+        running.ask("transitions", on=False)  # in a later turn
+        assert ("refused", refusal, "anna", None, None) in running.events
+        assert refusal not in running.log
+
+
+def test_why_the_robot_is_waited_for_is_in_the_log(bench):
+    tried = threading.Event()
+
+    def connect(*arguments, **more):
+        if running.agent.why == "nothing listens there":
+            tried.set()
+        raise LinkLost("nothing listens there")
+
+    running = bench(connect=connect)
+    with running:
+        assert tried.wait(DEADLINE)
+    assert running.log == ["waiting for the robot: nothing listens there"]
 
 
 def test_a_request_that_comes_on_the_way_to_a_scene_ends_that_and_not_the_agent(bench):

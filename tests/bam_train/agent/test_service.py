@@ -17,7 +17,6 @@ import bam_train.agent
 from bam_envs.core.errors import BamEnvsError
 from bam_train.agent.audit import tail
 from bam_train.agent.remote.agent_client import AgentClient
-from bam_train.agent.resident import ROBOT_FITS
 from bam_train.cli.flags import AgentConfig
 from bam_train.cli.program import parse
 from bam_train.errors import BamTrainError
@@ -116,7 +115,7 @@ def test_an_agent_that_was_killed_starts_paused_and_is_written_down(tmp_path, un
         until(lambda: "running" in (event.get("to") for event in tail(folder / "audit.jsonl")))  # another thread writes
         process.kill()
     with service(folder) as (process, url):
-        assert state(url, "paused")["why"] == ROBOT_FITS
+        assert state(url, "paused")["why"] == "it started paused"
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 143
     events = [event for event in tail(folder / "audit.jsonl") if event["what"] in ("started", "ended", "state")]

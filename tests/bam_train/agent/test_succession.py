@@ -1,6 +1,7 @@
 """Which version acts: candidates that come, are promoted, rolled back, or refused while the old one acts on."""
 
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,7 +33,7 @@ class Agent:
         interface = interface_of(make_env(env))
         self.session = SimpleNamespace(env_id=env, env_kwargs={}, interface=interface, is_real=False, identity="")
         self.succession, self.sent, self.notes = Succession(self, versions), [], []
-        self.answered, self.state, self.why = threading.Event(), State.TRIAL, ""
+        self.answered, self.state, self.why, self.since = threading.Event(), State.TRIAL, "", 0.0
         self.on_progress = lambda text: None
 
     def send(self, message):
@@ -132,22 +133,29 @@ def test_a_candidate_that_fails_or_is_too_slow_for_this_computer_is_rolled_back(
     assert choice.result == f"rolled back: {why}"
 
 
-def test_who_waits_for_the_trials_is_told_why_they_rest(agent, better, until):
+@pytest.mark.parametrize("first", [State.TRIAL, State.PAUSED])
+def test_who_waits_for_the_trials_is_told_why_they_rest(agent, better, until, first):
     def tell(state, why, text):
         agent.state, agent.why = state, why
         until(lambda: agent.sent[-1] == RequestProgress(1, text))
 
+    since, once = time.strftime("since %H:%M:%S", time.localtime(0.0)), "once somebody resumes the agent: "
+    resume, agent.state, agent.why = f"The trials go on {once}bam-agent resume URL", first, "paused by bob: lunch"
     agent.succession.begin(Ask(1, "push", {"path": str(better), "wait": True}, "anna", "10.0.0.7"))
-    tell(State.TRIAL, "push by anna", "acts as the candidate; its trials decide")
+    if first is State.PAUSED:  # the trials have not begun
+        paused = f"the agent is paused {since}: paused by bob: lunch. Its trials begin {once}bam-agent resume URL"
+        until(lambda: agent.sent[-1] == RequestProgress(1, f"is the candidate; {paused}"))
+        tell(State.TRIAL, "resumed by bob", "the trials begin")
+    else:
+        tell(State.TRIAL, "push by anna", "acts as the candidate; its trials decide")
     why = "The robot was stopped by following (G23): the elbow is away. When it is safe, resume the agent."
-    resume = "The trials go on once somebody resumes the agent: bam-agent resume"
-    tell(State.STOPPED, why, f"stopped by a guard: {why} {resume}")
+    tell(State.STOPPED, why, f"the agent is stopped by a guard {since}: {why} {resume}")
     tell(State.TRIAL, "resumed by bob", "the trials go on")
-    tell(State.PAUSED, "paused by bob", f"paused: paused by bob. {resume}")
-    text = "waiting for the robot: no state came. The trials go on once the robot is there again"
+    tell(State.PAUSED, "paused by bob", f"the agent is paused {since}: paused by bob. {resume}")
+    text = f"the agent is waiting for the robot {since}: no state came. The trials go on once the robot is there again"
     tell(State.WAITING, "no state came.", text)
-    text = "taken over: taken over by bob. The trials go on once the robot is handed back and the agent runs"
-    tell(State.TAKEN_OVER, "taken over by bob", text)
+    rest = "The trials go on once the robot is handed back and the agent runs"
+    tell(State.TAKEN_OVER, "taken over by bob", f"the agent is taken over {since}: taken over by bob. {rest}")
     agent.state = State.TRIAL
     agent.succession.choice.close("promoted: 33 of 33")
     assert agent.answered.wait(60)

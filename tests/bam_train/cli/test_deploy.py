@@ -105,6 +105,12 @@ def test_a_policy_on_another_computer(chunk_checkpoint, served, run):
         text = f"{urls[0]}: /bam/robot: that is a policy server, and no robot; give its address as --policy-server.\n"
         for flags in (("--print-contract",), ()):
             assert run(main, checkpoint, "--robot", urls[0], *flags) == (1, "", f"bam-deploy: {text}")
+        for url in urls:
+            status, _, err = run(main, checkpoint, "--transport", url)
+            assert (status, err.partition(" here; ")[2]) == (
+                1,
+                "a policy is served. Give its address as --policy-server.\n",
+            )
         for flags in (("--policy-server", urls[0], "--policy-ca-file", "x"), ("--policy-token-file", "x")):
             assert run(main, checkpoint, *flags, "--fast")[:2] == (1, "")
     status, out, err = run(main, checkpoint, *server, "--fast")

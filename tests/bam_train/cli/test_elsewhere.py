@@ -135,7 +135,8 @@ def test_a_server_that_is_not_there_is_named_by_what_the_checkpoint_needs(run, n
     assert (status, err) == (
         1,
         f"bam-deploy: ws://{nobody}: refused: nothing listens there. Is the port open? Start one with `bam-serve "
-        f"--env bam/ur-reach --port {port}` or `ros2 launch rosbridge_server rosbridge_websocket_launch.xml`.\n",
+        f"--env bam/ur-reach --port {port}` or `ros2 launch rosbridge_server rosbridge_websocket_launch.xml "
+        f"port:={port} address:=127.0.0.1`.\n",
     )
 
 

@@ -87,7 +87,8 @@ def test_what_serves_no_policy_is_refused(served, corridor_checkpoint):
     with served(gym.make("CartPole-v1")) as (url, _), pytest.raises(PolicyError) as error:
         PolicyLink(url)
     start = "Start one there: bam-serve --policy CHECKPOINT --port PORT"
-    assert str(error.value) == f"policy server {url}: it serves CartPole-v1, and no policy. {start}"
+    text = "that is the environment CartPole-v1, and no policy server; give its address as --robot or --transport"
+    assert str(error.value) == f"policy server {url}: {text}. {start}"
     with pytest.raises(NoServer) as error:
         PolicyLink(url)
     assert str(error.value) == f"policy server {url}: refused: nothing listens there. Is the port open? {start}"

@@ -26,6 +26,7 @@ from bam_envs.core.timing import Pacer
 from bam_envs.remote.serve.command_lease import LEASE_SECONDS, CommandLease
 from bam_envs.remote.wire.transport import EnvSpecMessage, Info, Seed
 from bam_envs.remote.wire.values import exact, pack, plain_info, stack
+from bam_envs.ros.codec import A_POLICY
 from bam_envs.rosbridge.bus import UNKNOWN_CALLER, Caller
 
 Env = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
@@ -133,7 +134,8 @@ class EnvServer:
         """
         wanted, served = (_other_names().get(one, one) for one in (_plain_name(name), _plain_name(self._spec.env_id)))
         if name and wanted != served:
-            raise RemoteError(f"There is no environment {name!r} here; {self._spec.env_id} is served.")
+            use = " Give its address as --policy-server." if self._spec.env_id == A_POLICY else ""
+            raise RemoteError(f"There is no environment {name!r} here; {self._spec.env_id} is served.{use}")
 
     def reset(
         self,

@@ -98,15 +98,15 @@ class ServedEnvironment:
         if options.name and profile is None:
             raise InvalidValue("--name is the name of a robot, and no robot is served here; leave it out.")
         robot = None if profile is None else _take_robot(self.env, profile, realtime)
-        server = EnvServer(self.env, lease=self.lease, realtime=realtime and robot is None)
+        served_as = getattr(self.env, "served_as", "")
+        server = EnvServer(self.env, env_id=served_as or None, lease=self.lease, realtime=realtime and robot is None)
         started.callback(server.close)
         self.lease.on_change(
             lambda before, after: self._tell(f"{after} is in command" if after else f"{before} is no longer in command")
         )
         if options.warning is not None:
             self._tell(options.warning)
-        served_as = getattr(self.env, "served_as", "")
-        name = served_as or server.spec().env_id
+        name = server.spec().env_id
         if options.has_topics or not served_as:
             self.bus = bus = self._open_bus(started)
             if robot is not None and profile is not None:

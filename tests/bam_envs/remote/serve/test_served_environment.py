@@ -87,9 +87,8 @@ def test_an_environment_without_a_robot_has_no_topics(serve_env, transport):
 
 def test_a_robot_is_looked_for_where_none_is(serve_env, link):
     served = serve_env("CartPole-v1")
-    text = (
-        f"{served.bus.url}: /bam/robot: 'CartPole-v1' is served there, and no robot; give its address as --transport."
-    )
+    where, use = f"{served.bus.url}: /bam/robot", "give its address as --transport"
+    text = f"{where}: that is the environment 'CartPole-v1', and no robot; {use}."
     with pytest.raises(ProtocolError, match=f"^{re.escape(text)}$"):
         robot_info(link(served.bus.url))
 
