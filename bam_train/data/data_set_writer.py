@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -75,12 +76,10 @@ class DataSetWriter:
             raise BadDataSet(f"{place}: is named as a file, and a data set is a folder; leave {suffix} out")
         self._together, self._flush_episodes, self._flush_bytes = together, flush_episodes, flush_bytes
         self._observation, self._action = info.observation_leaves, info.action_leaves
-        self._first = 0
-        """Number of the first file that can be taken back."""
         self._waiting: list[Columns] = []
         self._bytes = 0
-        self._before: dict[str, bytes | None] = {}
-        """Content of the files that are replaced, as it was; {} if nothing can be taken back."""
+        self._first, self._before = 0, dict[str, bytes | None]()
+        """Number of the first file that can be taken back, and the content of the others as it was."""
         self._lock = WriterLock(self._files)
         try:
             self._open()
@@ -114,8 +113,7 @@ class DataSetWriter:
         counts = (len(old), old.total_frames, old.next_file)
         self._head = Head(self.info, dict(old.extra), *counts, list(old.tasks), stats)
         if self._together:
-            self._first = self._head.file
-            self._before = {name: files.content(name) for name in _REPLACED}
+            self._remember()
 
     def __enter__(self) -> Self:
         return self
@@ -194,6 +192,8 @@ class DataSetWriter:
         if not self._waiting:
             return
         head = replace(self._head, tasks=[*self._head.tasks])
+        if not self._together:
+            self._remember()
         try:
             self._files.write_json(BAM, head.own())
             head.write_pair(self._files, self._waiting)
@@ -202,6 +202,8 @@ class DataSetWriter:
         except PlaceError as error:
             if self._together:
                 raise
+            with contextlib.suppress(PlaceError):
+                self._take_back()
             kept, lost = (counted(one, "whole episode") for one in (self._head.episodes, len(self._waiting)))
             raise OutputError(f"{error}. Kept in {self._files.text}: {kept}; not written: {lost}") from error
         self._head, self._waiting, self._bytes = head, [], 0
@@ -217,18 +219,24 @@ class DataSetWriter:
         """Take back what was added `together`, and let others write; a data set that was made is removed."""
         if not self._lock.is_held:
             return
-        files, before = self._files, self._before
         try:
-            if before:
-                self._put_back(INFO)  # first: it counts the other files
-                for number, kind in itertools.product(range(self._first, self._head.file + 1), _NUMBERED):
-                    files.delete(file_name(kind, number))
-                for name in _REPLACED:
-                    self._put_back(name)
+            if self._before:
+                self._take_back()
         finally:
             self._lock.release()
-        if before and before[INFO] is None:
-            files.remove_empty()
+        if self._before.get(INFO, b"") is None:
+            self._files.remove_empty()
+
+    def _remember(self) -> None:
+        self._first = self._head.file
+        self._before = {name: self._files.content(name) for name in _REPLACED}
+
+    def _take_back(self) -> None:
+        self._put_back(INFO)  # first: it counts the other files
+        for number, kind in itertools.product(range(self._first, self._head.file + 1), _NUMBERED):
+            self._files.delete(file_name(kind, number))
+        for name in _REPLACED:
+            self._put_back(name)
 
     def _put_back(self, name: str) -> None:
         content = self._before[name]

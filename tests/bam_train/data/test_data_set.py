@@ -133,6 +133,7 @@ def test_a_full_disk_says_what_is_kept_and_the_rest_is_written_once_there_is_roo
                 with pytest.raises(OutputError, match=full.format(place)):
                     writer.flush()
             assert len(DataSet.open(place)) == 2
+            assert look(Files(place)).is_whole
         assert [one.facts["seed"] for one in DataSet.open(place)] == [0, 1, 2]
         assert look(Files(place)).is_whole
 
