@@ -26,8 +26,8 @@ def shown(text: str) -> str:
 
 
 def counted(number: int, what: str) -> str:
-    """``1 episode``, ``2 episodes``, ``12,000 steps``: a number of things, `what` being one of them."""
-    return f"{number:,} {what}{'' if number == 1 else 's'}"
+    """``1 episode`` or ``2 episodes``: a number of things, `what` being one of them."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
