@@ -181,14 +181,15 @@ def _episode(
     tries = [(kept, digests[layout.EXTRA], "")] + ([([], None, "further columns")] if digests[layout.EXTRA] else [])
     for (names, extra, missing), end in itertools.product(tries, itertools.product(*ends)):
         full = {"episode_index": number, **known, **digests, layout.EXTRA: extra, **dict(zip(_ENDS, end, strict=True))}
-        gone_now = [*lost, *([missing] if missing else [])]
-        told = {"lost": " and ".join([*([facts["lost"]] if "lost" in facts else []), *gone_now])} if gone_now else {}
-        full |= {"bam/facts": json.dumps({**facts, **told}), "bam/columns": json.dumps(names)}
+        every = " and ".join([*lost, *([missing] if missing else [])])
+        all_lost = " and ".join(filter(None, [str(facts.get("lost", "")), every]))  # earlier ones, which were given up
+        told = {**facts, "lost": all_lost} if all_lost else facts
+        full |= {"bam/facts": json.dumps(told), "bam/columns": json.dumps(names)}
         try:
             found = data.read(full, steps.drop_columns([one for one in here if one not in names]), last)
         except layout.UNREADABLE:
             continue
-        return found, full | {"bam/digest": found.digest}, " and ".join(gone_now)
+        return found, full | {"bam/digest": found.digest}, every
     return None
 
 

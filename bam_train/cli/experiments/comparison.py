@@ -40,6 +40,7 @@ ALIKE = ("seed", "threads", "address", "device")
 INTERVALS = ("score", "difference", "better", "steps", "seconds")
 """Fields of `RowResult` that are intervals."""
 RULES = ("worse", "maybe-worse", "not-better")
+"""Of ``--fail-if``; see `RunComparison.failures`."""
 _FORMS: dict[str, Callable[[float | None], str]] = {"success": percent, "return": number, "score": number}
 _POSITIVE = (0.0, math.inf)
 NO_EVALUATION = "no evaluation is in its log; wait for the first one, or leave this run out"

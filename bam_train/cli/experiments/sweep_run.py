@@ -91,11 +91,8 @@ def _search(folder: SweepFolder, trials: int, minutes: float | None, address: st
         folder.study.set_user_attr("trials", trials)
     end = float("inf") if minutes is None else time.monotonic() + 60 * minutes
     search = Sweep(folder, trials, say)
-    with _runs(folder, address, track, f"{counted(trials, 'trial')} of {counted(folder.seeds, 'seed')}") as (
-        start,
-        jobs,
-        stopped,
-    ):
+    what = f"{counted(trials, 'trial')} of {counted(folder.seeds, 'seed')}"
+    with _runs(folder, address, track, what) as (start, jobs, stopped):
         display = LiveTable(search.runs) if can_draw() else PlainLines([])
         with contextlib.closing(search), display as table:
 
@@ -142,9 +139,8 @@ def _status(folder: SweepFolder) -> list[str]:
     base, best = folder.space.base, folder.best
     counts = {state: len(folder.trials(state)) for state in STATES}
     said = ", ".join(f"{number} {STATES[state]}" for state, number in counts.items() if number)
-    lines = [
-        f"{base.algo} on {base.env}, {counted(folder.seeds, 'seed')} a trial, in {folder.path}: {said or 'no trial'}"
-    ]
+    seeds = counted(folder.seeds, "seed")
+    lines = [f"{base.algo} on {base.env}, {seeds} a trial, in {folder.path}: {said or 'no trial'}"]
     if best is None:
         return [*lines, "no trial is done yet"]
     scores = ", ".join(f"{one:.4g}" for one in folder.outcome(best.number).get("scores", ()))
