@@ -15,6 +15,7 @@ from bam_train.cli.experiment import RobotFlags, open_env, play
 from bam_train.cli.flags import Assignments, CheckpointFile, Count, EnvId, Seed
 from bam_train.cli.program import guarded, parse
 from bam_train.evaluation import FIRST_SEED
+from bam_train.files.log_lines import counted
 from bam_train.policy import FrozenPolicy
 from bam_train.settings import read_env_kwargs
 
@@ -93,9 +94,9 @@ def run(args: Flags, name: str, default: str, kind: str) -> None:
             for number, record in enumerate(play(env, clipped, episodes=args.num_episodes, seed=args.seed), 1):
                 successes += bool(record.success)
                 how = "success" if record.success else "no success"
-                counted = f"clipped {clipped.clipped} of {record.length} actions"
-                print(f"episode {number}: return {record.total:.2f}, {how}, {counted}", flush=True)
-            tell(f"success in {successes} of {args.num_episodes} episodes on {checkpoint.manifest.env}")
+                cut = f"clipped {clipped.clipped} of {counted(record.length, 'action')}"
+                print(f"episode {number}: return {record.total:.2f}, {how}, {cut}", flush=True)
+            tell(f"success in {successes} of {counted(args.num_episodes, 'episode')} on {checkpoint.manifest.env}")
 
 
 def main(script: str, description: str, default: str, kind: str) -> int:

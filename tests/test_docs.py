@@ -441,7 +441,7 @@ def test_added_things_train_and_deploy(added):
             ["bam-deploy", out, "--env", arguments[1], "--episodes", "1", "--fast"],
         ]
     said = python("-c", COMMANDS, json.dumps(lines), folder=added)
-    assert len(re.findall("^episodes done: 1 of 1 episodes", said, re.MULTILINE)) == 3
+    assert len(re.findall("^episodes done: 1 of 1 episode,", said, re.MULTILINE)) == 3
 
 
 def test_added_environments_are_described(added):

@@ -38,6 +38,7 @@ from bam_train.errors import (
     SettingsError,
     UntrustedCheckpoint,
 )
+from bam_train.files.log_lines import counted
 from bam_train.policy import FrozenPolicy
 
 SHARE = 0.5
@@ -107,7 +108,7 @@ def _fit(checkpoint: Checkpoint, request: CandidateRequest) -> str:
         text = f"{what} is {one} in the checkpoint and {other} in {env} as the agent runs it"
         raise CheckpointMismatch(checkpoint.path, f"{text}. Push a checkpoint that was trained for that")
     period, number = interface["period"], sum(map(len, interface["signals"].values()))
-    signals = f"{number} signal{'' if number == 1 else 's'}"
+    signals = counted(number, "signal")
     return f"fits {env}: spaces, {signals}, period {'unknown' if period is None else f'{period:g} s'}"
 
 

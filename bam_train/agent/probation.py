@@ -23,6 +23,7 @@ from typing import Literal
 from bam_envs.core.timing import BUSY, WINDOW
 from bam_train.deploy.trials import ALPHA, Evidence
 from bam_train.errors import SettingsError
+from bam_train.files.log_lines import counted
 
 _ODDS = (2.0, 4.0, 16.0)
 """The alternatives m."""
@@ -137,7 +138,7 @@ class Probation:
         number, last = self._shortfall.episodes, len(self._recent)
         recent = f", {sum(self._recent)} of the last {last}" if last < number else ""
         shown = f"less than {100 * self._shortfall.bound:g} % (error probability at most {100 * ALPHA:g} %)"
-        return f"{self._successes} of {number} episodes succeeded{recent}, which shows {shown}"
+        return f"{self._successes} of {counted(number, 'episode')} succeeded{recent}, which shows {shown}"
 
     def _back(self, reason: str) -> Judgement:
         return Judgement("roll back", reason)

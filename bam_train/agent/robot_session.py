@@ -201,7 +201,7 @@ class RobotSession:
 
         try:
             info = info_of(self._env, self.env_id, self.env_kwargs, self.checkpoint.manifest.period)
-            for note in add_recording(Recording.open(recorder.path), data, info):
+            for note in add_recording(Recording.open(recorder.path), data, info)[1]:
                 _log.info("%s", note)
         except BamTrainError as error:
             _log.warning("%s; run bam-data import %s %s", error, data, recorder.path)

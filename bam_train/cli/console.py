@@ -9,14 +9,19 @@ import contextlib
 import logging
 import os
 import sys
+import time
 import traceback
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TextIO
 
-from bam_train.files.log_lines import ShownFormatter, shown
+from bam_train.files.log_lines import ShownFormatter, counted, shown
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
+
+_BETWEEN = 5.0
+"""Time between two lines about a long work [s]."""
 
 
 def say(text: str = "") -> None:
@@ -73,6 +78,25 @@ def show_logs_and_tracebacks() -> None:
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(ShownFormatter())
     sys.excepthook = say_traceback
+
+
+def progress(prog: str, what: str, total: int | None = None) -> Callable[[int], None]:
+    """What says how many pieces of a long work are done, every 5 s: ``bam-data: 12 of 40 episodes``.
+
+    Args:
+        prog: The program.
+        what: One of the pieces.
+        total: Their number, if it is known.
+    """
+    last = time.monotonic()
+
+    def say_done(done: int) -> None:
+        nonlocal last
+        if done != total and time.monotonic() - last > _BETWEEN:
+            last = time.monotonic()
+            say(f"{prog}: {counted(done, what) if total is None else f'{done} of {counted(total, what)}'}")
+
+    return say_done
 
 
 # Numbers for people

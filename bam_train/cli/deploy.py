@@ -133,18 +133,20 @@ def _add_to_data_set(
     if recorder is None or config.record is None:
         return
     from bam_train.data.recordings import add_recording, is_data_set
-    from bam_train.errors import BamTrainError
+    from bam_train.errors import BamTrainError, kind_of
     from bam_train.recording.recording import Recording
 
     if not is_data_set(str(config.record)):
         return
     try:
-        for note in add_recording(Recording.open(recorder.path), config.record, _info(config, checkpoint, env)):
-            say(f"bam-deploy: note: {note}")
+        recording = Recording.open(recorder.path)
+        found, notes = add_recording(recording, config.record, _info(config, checkpoint, env))
     except BamTrainError as error:
         again = f"bam-data import {config.record} {recorder.path}"
-        raise type(error)(f"{error}. The recording is whole: run {again}") from error
-    say(f"bam-deploy: {recorder.path} is in {config.record} now")
+        raise BamTrainError(f"{error}. The recording is whole: run {again}", kind=kind_of(error)) from error
+    for note in notes:
+        say(f"bam-deploy: note: {note}")
+    say(f"bam-deploy: {recorder.path} {f'is in {config.record} now' if found else 'has no whole episode to add'}")
 
 
 def _info(config: DeployConfig, checkpoint: Checkpoint, env: gym.Env[Any, Any]) -> DataSetInfo:

@@ -15,6 +15,7 @@ import numpy as np
 from bam_envs.core.timing import Pacer
 from bam_train.cli.console import rich_text
 from bam_train.deploy.journal import EpisodeRecord, Journal, lateness_text, rate_text
+from bam_train.files.log_lines import counted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -43,7 +44,7 @@ class PlainDeployment:
     def ended(self, record: EpisodeRecord) -> None:
         """Write such as ``episode 2/5 (seed 8): success after 47 steps, return 12.31``."""
         how = {True: "success", False: "no success", None: record.end}[record.success]
-        steps = f"{record.length} step{'' if record.length == 1 else 's'}"
+        steps = counted(record.length, "step")
         which = f"episode {self._journal.begun}/{self._journal.wanted} (seed {record.seed})"
         self._write(f"{which}: {how} after {steps}, return {record.total:.2f}{self._journal.marked}")
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import tell
 from bam_train.cli.program import run_program
-from bam_train.files.log_lines import aligned
+from bam_train.files.log_lines import aligned, counted
 
 if TYPE_CHECKING:
     from bam_train.cli.flags import EnvsConfig
@@ -111,7 +111,7 @@ def detail_lines(facts: dict[str, Any]) -> list[str]:
         live = ", with a live robot: rs_address='IP:PORT' or robot='ws://IP:PORT'" if facts["is_live"] else ""
         lines.append(f"{'BAM' if facts['id'] in BAM_NAMES else 'robo-gym'}'s name of {facts['same_as']}{live}")
     count = facts["episode_steps"]
-    steps = "no time limit" if count is None else f"{count} step{'s' * (count > 1)} an episode"
+    steps = "no time limit" if count is None else f"{counted(count, 'step')} an episode"
     lines.append(f"{steps}, {'no rate given' if facts['rate_hz'] is None else format(facts['rate_hz'], 'g') + ' Hz'}")
     if facts["note"]:
         lines.append(facts["note"])

@@ -8,8 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bam_train.cli.console import say, tell
+from bam_train.cli.console import progress, say, tell
 from bam_train.cli.program import run_program
+from bam_train.files.log_lines import counted
 
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
@@ -276,9 +277,10 @@ def _record(config: EvalConfig, subject: _Subject, path: Path) -> None:
 
     episodes = min(config.video_episodes, config.episodes)
     env = make_env(subject.env, subject.env_kwargs, render_mode="rgb_array")
-    with closing(env), open_video(path, 1 / (control_period(env) or 1 / 30)) as add:
+    rate = 1 / (control_period(env) or 1 / 30)
+    with closing(env), open_video(path, rate, progress("bam-eval", "picture")) as add:
         count = record_video(env, subject.policy, add, episodes=episodes, seed=config.seed)
-    say(f"bam-eval: the video is {path}: {episodes} episode{'' if episodes == 1 else 's'}, {count} pictures")
+    say(f"bam-eval: the video is {path}: {counted(episodes, 'episode')}, {counted(count, 'picture')}")
 
 
 main = partial(run_program, "bam-eval", "bam_train.cli.flags:EvalConfig", lambda config, _: evaluate_checkpoint(config))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from bam_train.cli.console import count, drop, duration, make_console, number, percent, rich_text, say
 from bam_train.errors import OutputError
+from bam_train.files.log_lines import counted
 from bam_train.files.place import with_addresses
 
 if TYPE_CHECKING:
@@ -74,7 +75,9 @@ class PlainDisplay:
         success = "" if report.success_rate is None else f"success {percent(report.success_rate)}, "
         rest = f"return {number(report.return_mean)}, {report.length_mean:.0f} steps an episode"
         newest = ", the best so far" if best else ""
-        self.note(f"evaluation at {count(steps)} steps: {success}{rest} ({report.episodes} episodes){newest}")
+        self.note(
+            f"evaluation at {count(steps)} steps: {success}{rest} ({counted(report.episodes, 'episode')}){newest}"
+        )
 
     def note(self, text: str) -> None:
         """Print a message."""
@@ -166,7 +169,7 @@ def _score_text(best: Scores) -> str:
     if rate is not None:
         between = f" (95 %: {percent(interval[0])} to {percent(interval[1])})" if interval else ""
         success = f"success {percent(rate)}{between}, "
-    episodes = f" over {best['episodes']} episodes" if best.get("episodes") is not None else ""
+    episodes = f" over {counted(best['episodes'], 'episode')}" if best.get("episodes") is not None else ""
     return f"{success}return {number(best.get('return_mean'))}{episodes}, after {count(best['steps'])} steps"
 
 

@@ -48,6 +48,7 @@ from bam_envs.core.wording import did_you_mean
 from bam_envs.live.robot_checks import Check
 from bam_train.checkpoint.manifest import Chunk
 from bam_train.errors import CheckpointError
+from bam_train.files.log_lines import counted
 from bam_train.settings import tomllib
 
 Array = NDArray[Any]
@@ -118,7 +119,7 @@ class Port:
         whole = {"size": size, "mean": self.mean or (0.0,) * size[0], "std": self.std or (scale,) * size[0]}
         for name, value in {**whole, "units": self.units or "si", "low": self.low, "high": self.high}.items():
             if name not in ("size", "units") and len(value) not in (size[0], 0):
-                raise InvalidValue(f"{self.name}: {name}: expected {size[0]} numbers, found {len(value)}")
+                raise InvalidValue(f"{self.name}: {name}: expected {counted(size[0], 'number')}, found {len(value)}")
             object.__setattr__(self, name, value)
 
     @property
@@ -245,10 +246,10 @@ def _vector_rows(
 ) -> Iterator[Check]:
     """With `whole`, each of the environment's numbers has to be among the policy's, and all of these once."""
     if not port.names:
-        yield Check(what, f"{math.prod(port.size)} numbers", f"{count} numbers", fits=(count,) == port.size)
+        yield Check(what, counted(math.prod(port.size), "number"), counted(count, "number"), fits=(count,) == port.size)
         return
     if (len(port.names),) != port.size:
-        yield Check(what, f"{port.size[0]} numbers", f"{len(port.names)} names", fits=False)
+        yield Check(what, counted(port.size[0], "number"), counted(len(port.names), "name"), fits=False)
         return
     ours, theirs = [str(label["name"]) for label in labels], [plain_name(name) for name in port.names]
     for name, theirs_name in zip(theirs, port.names, strict=True):

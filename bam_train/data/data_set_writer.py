@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -12,11 +14,24 @@ import numpy as np
 from bam_envs.core.wording import brief
 from bam_train.data.data_set import DataSet
 from bam_train.data.file_pair import Columns, Head, kind_of
-from bam_train.data.layout import BAM, COPIES, DATA, DEFAULTS, EPISODES, INFO, Files, WriterLock, file_name
+from bam_train.data.layout import (
+    BAM,
+    COPIES,
+    DATA,
+    DEFAULTS,
+    EPISODES,
+    INFO,
+    STATS,
+    TASKS,
+    Files,
+    WriterLock,
+    file_name,
+)
 from bam_train.data.mending import mend
 from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, digest_of
 from bam_train.environments import first_difference
-from bam_train.errors import BadDataSet
+from bam_train.errors import BadDataSet, OutputError, PlaceError
+from bam_train.files.log_lines import counted
 from bam_train.files.place import Place
 
 if TYPE_CHECKING:
@@ -24,6 +39,7 @@ if TYPE_CHECKING:
 
 _OF_FILES = (".mcap", ".txt", ".json", ".csv", ".zip", ".parquet", ".h5", ".hdf5", ".gif", ".mp4", ".png", ".jpg")
 """Suffixes of files; no folder of such a name is made."""
+_NUMBERED, _REPLACED = (DATA, EPISODES, COPIES), (INFO, STATS, TASKS, BAM)
 
 
 class DataSetWriter:
@@ -34,6 +50,8 @@ class DataSetWriter:
     Args:
         place: The folder.
         info: What is equal for all episodes; it must be that of the episodes that are there.
+        together: Whether all that is added counts at the end, or nothing: after an exception in the ``with`` block, or
+            `undo`, the place is as it was. Else the episodes that are whole are kept.
         flush_episodes: Number of episodes that are kept in memory before they are written.
         flush_bytes: Size of episodes in memory [bytes] from which they are written earlier.
 
@@ -43,30 +61,41 @@ class DataSetWriter:
     """
 
     def __init__(
-        self, place: str | Path | Place, info: DataSetInfo, *, flush_episodes: int = 50, flush_bytes: int = 2**26
+        self,
+        place: str | Path | Place,
+        info: DataSetInfo,
+        *,
+        together: bool = False,
+        flush_episodes: int = 50,
+        flush_bytes: int = 2**26,
     ) -> None:
         import pyarrow  # noqa: F401 - it writes the episodes, and without it nothing must be made
 
         self._files, self.info = Files(place), info
         if (suffix := self._files.root.suffix.lower()) in _OF_FILES and not self._files.root.exists():
             raise BadDataSet(f"{place}: is named as a file, and a data set is a folder; leave {suffix} out")
-        self._flush_episodes, self._flush_bytes = flush_episodes, flush_bytes
+        self._together, self._flush_episodes, self._flush_bytes = together, flush_episodes, flush_bytes
         self._observation, self._action = info.observation_leaves, info.action_leaves
         self._waiting: list[Columns] = []
         self._bytes = 0
+        self._first, self._before = 0, dict[str, bytes | None]()
+        """Number of the first file that can be taken back, and the content of the others as it was."""
         self._lock = WriterLock(self._files)
         try:
             self._open()
         except BaseException:
-            self._lock.release()
+            self.undo()
             raise
+        self._counted = self._head
+        if not together:
+            self._before = {}
 
     def _open(self) -> None:
-        files, kinds = self._files, (DATA, EPISODES, COPIES)
+        files = self._files
         if not files.exists(INFO):
-            if any(files.numbers(kind) for kind in kinds):
+            if any(files.numbers(kind) for kind in _NUMBERED):
                 raise files.damaged(f"{INFO} is missing")
-            self._head = Head(self.info, {})
+            self._head, self._before = Head(self.info, {}), dict.fromkeys(_REPLACED)
             files.write_json(BAM, self._head.own())
             self._head.write(files)
             return
@@ -76,13 +105,15 @@ class DataSetWriter:
             stats = old.stats()
         except BadDataSet:
             stats = None
-        if stats is None or any(files.exists(file_name(kind, old.next_file)) for kind in kinds):
+        if stats is None or any(files.exists(file_name(kind, old.next_file)) for kind in _NUMBERED):
             if lost := mend(files).lost:  # else a writer was killed
                 raise files.damaged(f"is damaged: {lost[0]}")
             old = DataSet.open(files.text)
             stats = old.stats()
         counts = (len(old), old.total_frames, old.next_file)
         self._head = Head(self.info, dict(old.extra), *counts, list(old.tasks), stats)
+        if self._together:
+            self._remember()
 
     def __enter__(self) -> Self:
         return self
@@ -90,7 +121,10 @@ class DataSetWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self.close()
+        if kind is not None and self._together:
+            self.undo()
+        else:
+            self.close()
 
     def add(self, episode: Episode) -> int:
         """Add an episode, whose digest is filled in; returns its index. It is on the disk after the next flush.
@@ -150,21 +184,76 @@ class DataSetWriter:
         return array
 
     def flush(self) -> None:
-        """Write the episodes in memory: a copy, a data file, an episodes file, then info.json."""
+        """Write the episodes in memory: a copy, a data file, an episodes file, then, unless `together`, info.json.
+
+        Raises:
+            OutputError: Something cannot be written; the text says which episodes are kept.
+        """
         if not self._waiting:
             return
-        self._files.write_json(BAM, self._head.own())
-        self._head.write_pair(self._files, self._waiting)
-        self._head.write(self._files)
-        self._waiting, self._bytes = [], 0
+        head = replace(self._head, tasks=[*self._head.tasks])
+        if not self._together:
+            self._remember()
+        try:
+            self._files.write_json(BAM, head.own())
+            head.write_pair(self._files, self._waiting)
+            if not self._together:
+                head.write(self._files)
+        except PlaceError as error:
+            if self._together:
+                raise
+            with contextlib.suppress(PlaceError):
+                self._take_back()
+            kept, lost = (counted(one, "whole episode") for one in (self._head.episodes, len(self._waiting)))
+            raise OutputError(f"{error}. Kept in {self._files.text}: {kept}; not written: {lost}") from error
+        self._head, self._waiting, self._bytes = head, [], 0
+
+    def commit(self) -> None:
+        """Flush, and let what was added `together` count; until it is closed, `undo` takes it back."""
+        self.flush()
+        if self._together and self._counted is not self._head:
+            self._head.write(self._files)
+            self._counted = self._head
+
+    def undo(self) -> None:
+        """Take back what was added `together`, and let others write; a data set that was made is removed."""
+        if not self._lock.is_held:
+            return
+        try:
+            if self._before:
+                self._take_back()
+        finally:
+            self._lock.release()
+        if self._before.get(INFO, b"") is None:
+            self._files.remove_empty()
+
+    def _remember(self) -> None:
+        self._first = self._head.file
+        self._before = {name: self._files.content(name) for name in _REPLACED}
+
+    def _take_back(self) -> None:
+        self._put_back(INFO)  # first: it counts the other files
+        for number, kind in itertools.product(range(self._first, self._head.file + 1), _NUMBERED):
+            self._files.delete(file_name(kind, number))
+        for name in _REPLACED:
+            self._put_back(name)
+
+    def _put_back(self, name: str) -> None:
+        content = self._before[name]
+        if content is None:
+            self._files.delete(name)
+        elif content != self._files.content(name):
+            self._files.write(name, content)
 
     def close(self) -> None:
         """Flush, and let others write."""
         if self._lock.is_held:
             try:
-                self.flush()
-            finally:
-                self._lock.release()
+                self.commit()
+            except BaseException:
+                self.undo() if self._together else self._lock.release()
+                raise
+            self._lock.release()
 
 
 def require_same(place: str, there: DataSetInfo, given: DataSetInfo, whose: str = "", remedy: str = "") -> None:

@@ -16,6 +16,7 @@ does not count yet does not exist for readers.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import itertools
@@ -144,6 +145,16 @@ class Files:
         """Delete a file, if it is there."""
         if self.exists(name):
             (self.root / name).delete()
+
+    def remove_empty(self) -> None:
+        """Remove the folders of a data set that has no file any more."""
+        if self.exists(LOCK):
+            self.delete(LOCK)
+        if (root := self.root.local) is not None:
+            folders = [root / name for name in ("copies", "data", "meta/episodes", "meta")]
+            for path in [*(chunk for one in folders for chunk in one.glob("chunk-*")), *folders, root]:
+                with contextlib.suppress(OSError):  # it is not there, or not empty
+                    path.rmdir()
 
     def open_parquet(self, name: str, columns: Sequence[str] | None = None) -> Any:
         """A ``pyarrow.parquet.ParquetFile``, or the table of some of its columns.

@@ -129,6 +129,7 @@ def _look(reader: _Reader) -> tuple[Found, set[int]]:
     last = reader.copy(reader.numbers[-1]) if reader.numbers else None
     known, whole = {*head.features()}, set[Any]()
     lost: list[tuple[str, dict[str, Any], str]] = []
+    given_up: list[tuple[str, dict[str, Any], str]] = []
     for pair in reader.pairs():
         name, before = file_name(layout.DATA, pair.number), len(found.problems)
         if pair.number > head.file and not reader.is_cut_off:
@@ -153,6 +154,8 @@ def _look(reader: _Reader) -> tuple[Found, set[int]]:
         found.problems += _problems(pair, columns, head)
         for row, one in zip(pair.rows, columns, strict=True):
             found.notes += _odd(row["episode_index"], one.episode)
+            if "lost" in one.episode.facts and all(row is not other for other, _ in pair.lost):
+                given_up.append((name, row, one.episode.facts["lost"]))
             new = [column for column in one.episode.columns if column not in known]
             found.notes += [f"column {column} is not described in {layout.BAM}; it is kept" for column in new]
             known |= {*new}
@@ -166,6 +169,7 @@ def _look(reader: _Reader) -> tuple[Found, set[int]]:
         lost += [("no file", {"episode_index": index}, "") for index in range(head.episodes, counted)]
     lost = [one for one in lost if (one[1].get("bam/digest"), one[1].get("bam/facts")) not in whole or one[2]]
     found.lost = [*_lines(lost)]
+    found.notes += [f"given up before: {line}" for line in _lines(given_up)]
     if found.is_whole:
         found.problems += _differences(files, head, said, last)
     return found, left_over

@@ -97,7 +97,9 @@ def info_of_rows(source: Path, env: str | None, env_kwargs: Mapping[str, Any]) -
     return info
 
 
-def add_recording(recording: Recording, place: str | Path | Place, info: DataSetInfo, **options: Any) -> list[str]:
+def add_recording(
+    recording: Recording, place: str | Path | Place, info: DataSetInfo, **options: Any
+) -> tuple[int, list[str]]:
     """Add the episodes of a recording to a data set, as `add_episodes`."""
     return add_episodes(recording.path, episodes_of(recording, info), place, info, **options)
 
@@ -110,8 +112,10 @@ def add_episodes(
     *,
     again: bool = False,
     **facts: Any,
-) -> list[str]:
+) -> tuple[int, list[str]]:
     """Add the episodes of a recording or of rows to a data set, but for those that it has already.
+
+    Where there is none to add, or after an exception, the place is as it was.
 
     An episode of rows is there already if the data set has one with the same steps and end, with rewards as float32,
     which rows keep.
@@ -125,10 +129,12 @@ def add_episodes(
         facts: Further facts of every episode.
 
     Returns:
-        A line for each reason for which episodes were added with a fault, or left out.
+        How many of its episodes are in the data set now, and a line for each reason for which episodes were added with
+        a fault, or left out.
     """
     notes: dict[str, list[int]] = {}
-    with DataSetWriter(place, info) as writer:
+    count = 0
+    with DataSetWriter(place, info, together=True) as writer:
         data = DataSet.open(place)
         known = [data.facts(i) for i in range(len(data))]
         there: Counter[Any] = Counter((row.get("recording"), row.get("number")) for row in known)
@@ -138,6 +144,7 @@ def add_episodes(
             alike = [i for i, row in enumerate(known) if row["length"] in lengths]
             there = Counter(_in_rows(episode, info) for episode in data.episodes(alike))
         for episode, note in episodes:
+            note = note if len(episode) else "left out: it has no step"
             key = _in_rows(episode, info) if is_rows(source) else (episode.facts["recording"], episode.facts["number"])
             is_there, there[key] = not again and there[key] > 0, there[key] - 1
             for text in (
@@ -145,10 +152,14 @@ def add_episodes(
                 f"is in {place} already; bam-data import --again adds it all the same" if is_there else "",
             ):
                 notes.setdefault(text, []).append(episode.facts["number"])
-            if len(episode) and not is_there and "left out" not in note:
+            is_whole = "left out" not in note
+            count += is_whole
+            if is_whole and not is_there:
                 writer.add(replace(episode, facts={**episode.facts, **facts}))
+        if not count:
+            writer.undo()
     more = {text: f" and {len(numbers) - 1} more" if len(numbers) > 1 else "" for text, numbers in notes.items()}
-    return [f"{source}: episode {numbers[0]}{more[text]}: {text}" for text, numbers in notes.items() if text]
+    return count, [f"{source}: episode {numbers[0]}{more[text]}: {text}" for text, numbers in notes.items() if text]
 
 
 def episodes_of(recording: Recording, info: DataSetInfo) -> Iterator[tuple[Episode, str]]:

@@ -168,7 +168,7 @@ def _episode(
     if last is None or not {layout.FINAL + name for name in observed} <= {*last.column_names}:
         # Learners take no value after a terminated episode; any other one ends before its last step.
         lost.append("last observation" if ends[0][0] else "last step")
-        facts, digests["bam/digest"] = {**facts, "lost": lost[-1]}, None
+        digests["bam/digest"] = None
         last = steps.slice(len(steps) - 1).select(observed).rename_columns([layout.FINAL + name for name in observed])
         if not ends[0][0]:
             steps, ends = steps.slice(0, len(steps) - 1), [[False], [True], ends[2][:1]]
@@ -181,12 +181,15 @@ def _episode(
     tries = [(kept, digests[layout.EXTRA], "")] + ([([], None, "further columns")] if digests[layout.EXTRA] else [])
     for (names, extra, missing), end in itertools.product(tries, itertools.product(*ends)):
         full = {"episode_index": number, **known, **digests, layout.EXTRA: extra, **dict(zip(_ENDS, end, strict=True))}
-        full |= {"bam/facts": json.dumps(facts), "bam/columns": json.dumps(names)}
+        every = " and ".join([*lost, *([missing] if missing else [])])
+        all_lost = " and ".join(filter(None, [str(facts.get("lost", "")), every]))  # earlier ones, which were given up
+        told = {**facts, "lost": all_lost} if all_lost else facts
+        full |= {"bam/facts": json.dumps(told), "bam/columns": json.dumps(names)}
         try:
             found = data.read(full, steps.drop_columns([one for one in here if one not in names]), last)
         except layout.UNREADABLE:
             continue
-        return found, full | {"bam/digest": found.digest}, " and ".join([*lost, *([missing] if missing else [])])
+        return found, full | {"bam/digest": found.digest}, every
     return None
 
 

@@ -7,7 +7,7 @@ import hashlib
 import json
 import operator
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ from bam_train.data.data_set_writer import DataSetWriter, require_same
 from bam_train.data.recordings import require_addable
 from bam_train.errors import BadDataSet, SettingsError
 
+_Sources = Sequence[tuple[DataSet, Sequence[int]]]
+"""Data sets, and the indices of some of their episodes."""
 _SIGNS: dict[str, Callable[[Any, Any], bool]] = {
     "!=": operator.ne,
     ">=": operator.ge,
@@ -35,11 +37,12 @@ def merge(sets: Sequence[DataSet], out: str | Path) -> tuple[int, int]:
         How many were added, and how many were left out because they are there already.
 
     Raises:
-        BadDataSet: Two are of different environments, spaces, units or periods; nothing is written then.
+        BadDataSet: Two are of different environments, spaces, units or periods.
+        OutputError: `out` cannot be written. After any exception, it is as it was.
     """
     for one in sets[1:]:
         require_same(sets[0].place, sets[0].info, one.info, one.place, f"merge {one.place} into another place")
-    return _copy([(one, range(len(one))) for one in sets], out)
+    return _copy({out: [(one, range(len(one))) for one in sets]})[0]
 
 
 def choose(data: DataSet, conditions: Sequence[str]) -> list[int]:
@@ -95,12 +98,12 @@ def copy_episodes(data: DataSet, parts: Mapping[str, Sequence[int]]) -> list[tup
     """Add the episodes of these indices of `data` to the data set at each place; returns for each as `merge`.
 
     Raises:
-        BadDataSet: One of the places does not take them; nothing is written then.
+        BadDataSet: One of the places does not take them.
+        OutputError: One cannot be written. After any exception, all places are as they were.
     """
     for out in parts:
-        _require_other(data, out)
         require_addable(out, data.info)
-    return [_copy([(data, indices)], out) for out, indices in parts.items()]
+    return _copy({out: [(data, indices)] for out, indices in parts.items()})
 
 
 def split(data: DataSet, share: float, by: str | None = None) -> tuple[list[int], list[int]]:
@@ -124,24 +127,30 @@ def split(data: DataSet, share: float, by: str | None = None) -> tuple[list[int]
     return parts
 
 
-def _copy(sources: Iterable[tuple[DataSet, Sequence[int]]], out: str | Path) -> tuple[int, int]:
-    sources = list(sources)
-    for one, _ in sources:
-        _require_other(one, out)
-    added = left_out = 0
-    with DataSetWriter(out, sources[0][0].info) as writer:
-        there = set(DataSet.open(out).digests)
-        for data, indices in sources:
-            new = [i for i in indices if data.digests[i] not in there]
-            left_out += len(indices) - len(new)
-            for episode in data.episodes(new):
-                if episode.digest in there:
-                    left_out += 1
-                    continue
+def _copy(parts: Mapping[Any, _Sources]) -> list[tuple[int, int]]:
+    """Add episodes of other data sets to each place, to all of them or to none; returns for each as `merge`."""
+    for out, sources in parts.items():
+        for one, _ in sources:
+            _require_other(one, out)
+    with contextlib.ExitStack() as stack:
+        writers = [
+            stack.enter_context(DataSetWriter(out, sources[0][0].info, together=True)) for out, sources in parts.items()
+        ]
+        added = [_add(writer, out, sources) for writer, (out, sources) in zip(writers, parts.items(), strict=True)]
+        for writer in writers:
+            writer.commit()
+    return added
+
+
+def _add(writer: DataSetWriter, out: str | Path, sources: _Sources) -> tuple[int, int]:
+    added, there = 0, set(DataSet.open(out).digests)
+    for data, indices in sources:
+        for episode in data.episodes([i for i in indices if data.digests[i] not in there]):
+            if episode.digest not in there:
                 there.add(episode.digest)
                 writer.add(episode)
                 added += 1
-    return added, left_out
+    return added, sum(len(indices) for _, indices in sources) - added
 
 
 def _require_other(data: DataSet, out: str | Path) -> None:

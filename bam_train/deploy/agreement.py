@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.robot import RobotSpec, RobotState
 from bam_envs.safety.guard import Limits, columns_in, is_base, measured_places
+from bam_train.files.log_lines import counted
 
 Array = NDArray[np.float64]
 STILL = 0.02
@@ -43,9 +44,12 @@ class Agreement:
     def text(self) -> str:
         """One line: ``agreement with whoever drives: 0.83 (0.79 to 0.87) in 412 moving ticks``."""
         if self.mean is None and self.ticks:
-            return f"agreement with whoever drives: nobody drove; the policy would have moved in {self.ticks} ticks"
+            moving = counted(self.ticks, "tick")
+            return f"agreement with whoever drives: nobody drove; the policy would have moved in {moving}"
         if self.mean is None:
-            return f"agreement with whoever drives: nobody moved, nor would the policy, in {self.still} ticks"
+            return (
+                f"agreement with whoever drives: nobody moved, nor would the policy, in {counted(self.still, 'tick')}"
+            )
         between = "too short for an interval"
         if self.interval is not None:
             between = f"{self.interval[0]:.2f} to {self.interval[1]:.2f}"

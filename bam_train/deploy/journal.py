@@ -13,6 +13,7 @@ from bam_envs.safety.unusual import UnusualObservations
 from bam_train.checkpoint import Checkpoint
 from bam_train.deploy.agreement import Shadow
 from bam_train.deploy.trials import Trials
+from bam_train.files.log_lines import counted
 from bam_train.recording.recorder import Recorder
 
 
@@ -204,9 +205,9 @@ class DeployReport:
         journal, reason = self.journal, self.ending.reason.partition(":")[0]
         successes = journal.successes
         succeeded = "" if successes is None else f", {successes} success{'' if successes == 1 else 'es'}"
-        episodes = f"{journal.completed} of {journal.wanted} episodes{succeeded}"
+        episodes = f"{journal.completed} of {counted(journal.wanted, 'episode')}{succeeded}"
         return [
-            f"{reason}: {episodes}, {self.pacer.ticks} ticks, {rate_text(self.pacer)}{journal.marked}",
+            f"{reason}: {episodes}, {counted(self.pacer.ticks, 'tick')}, {rate_text(self.pacer)}{journal.marked}",
             *([f"lateness {lateness_text(self.pacer)}"] if self.pacer.period is not None else []),
             *([guards_text(self.guards, self.pacer.ticks)] if self.guards else []),
             *([self.trials.evidence.text] if self.trials else []),
@@ -225,7 +226,7 @@ def lateness_text(pacer: Pacer) -> str:
     """The lateness, such as ``p50 0.08 ms, p99 0.30 ms, max 1.20 ms, no deadline missed``."""
     late = _milliseconds(pacer.lateness)
     figures = [f"{name} {value:.2f} ms" for name, value in late.items()] if late else ["none yet"]
-    return ", ".join([*figures, f"{pacer.missed or 'no'} deadline{'s' if pacer.missed > 1 else ''} missed"])
+    return ", ".join([*figures, f"{counted(pacer.missed, 'deadline') if pacer.missed else 'no deadline'} missed"])
 
 
 def recorded_text(recorder: Recorder) -> str:
@@ -240,7 +241,11 @@ def guards_text(guards: Mapping[str, Mapping[str, Any]], ticks: int) -> str:
     """
 
     def count(times: int) -> str:
-        return f"in {times} of {ticks} ticks ({100 * times / ticks:.1f} %)" if times <= ticks else f"{times} times"
+        return (
+            f"in {times} of {counted(ticks, 'tick')} ({100 * times / ticks:.1f} %)"
+            if times <= ticks
+            else f"{times} times"
+        )
 
     counts = {
         what: ", ".join(f"{name} ({row['number']}) {count(row[what])}" for name, row in guards.items() if row.get(what))

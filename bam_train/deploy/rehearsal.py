@@ -19,6 +19,7 @@ from bam_train.deploy.journal import EpisodeRecord
 from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import LateChunk, SettingsError
 from bam_train.evaluation import wilson_interval
+from bam_train.files.log_lines import counted
 from bam_train.policy import FrozenPolicy
 from bam_train.policy.background import Background, ChunkRequest
 from bam_train.policy.chunks import Plan
@@ -75,12 +76,12 @@ class RehearsalReport:
         if facts["time_to_stop_s"] is not None:
             times = "p50 {p50:.2f} s, max {max:.2f} s from a halt to rest".format(**facts["time_to_stop_s"])
         if facts["halts_without_rest"]:
-            times += f"; after {facts['halts_without_rest']} of {len(self.halts)} halts it did not rest"
+            times += f"; after {facts['halts_without_rest']} of {counted(len(self.halts), 'halt')} it did not rest"
         ticks = sum(record.length for record in self.records)
         rows = [
-            ("stopped", "stopped", f"{facts['episodes']} episodes"),
-            ("held", "held", f"{ticks} ticks"),
-            ("limited", "altered", f"{ticks} ticks"),
+            ("stopped", "stopped", counted(facts["episodes"], "episode")),
+            ("held", "held", counted(ticks, "tick")),
+            ("limited", "altered", counted(ticks, "tick")),
         ]
         return [
             f"{self.checkpoint} on {self.env} behind {self.link}, with the guards of a live robot",

@@ -34,6 +34,7 @@ from typing import IO, Any
 from bam_train.checkpoint.ownership import who_else
 from bam_train.errors import FormatError
 from bam_train.files.atomic_file import lock
+from bam_train.files.log_lines import counted
 
 ALPHA = 0.05
 """Maximum probability that a policy passes although its success rate is not above the threshold."""
@@ -87,7 +88,7 @@ class Evidence:
     @property
     def text(self) -> str:
         """One line: ``18 of 19 trials succeeded; 30 more without a failure would show more than 90 %``."""
-        done = f"{self.successes} of {self.trials} trial{'' if self.trials == 1 else 's'} succeeded"
+        done = f"{self.successes} of {counted(self.trials, 'trial')} succeeded"
         above = f"more than {100 * self.threshold:g} %"
         if self.repeated:
             done = f"{done} ({self.repeated} more repeated a seed, and a seed counts once)"

@@ -26,6 +26,7 @@ from bam_train.estimation.estimates import (
 from bam_train.estimation.fitted_q import FittedQ, fit_q
 from bam_train.estimation.steps import Steps, read_steps
 from bam_train.evaluation import wilson_interval
+from bam_train.files.log_lines import counted
 from bam_train.policy import FrozenPolicy
 
 Seen = Literal["refuse", "skip", "use"]
@@ -169,7 +170,7 @@ def unseen_indices(checkpoint: Checkpoint, data: DataSet, seen: Seen) -> list[in
     learnt = set(checkpoint.manifest.data.get("episodes", ()))
     known = [digest in learnt for digest in data.digests]
     if any(known) and seen == "refuse":
-        text = f"learnt from {sum(known)} of the {len(known)} episodes of {data.place}"
+        text = f"learnt from {sum(known)} of the {counted(len(known), 'episode')} of {data.place}"
         raise CheckpointMismatch(
             checkpoint.path, f"{text}. Give other data, --seen skip to leave them out, or --seen use"
         )
@@ -181,7 +182,7 @@ def unseen_indices(checkpoint: Checkpoint, data: DataSet, seen: Seen) -> list[in
 def require_enough(data: DataSet, episodes: int) -> None:
     """Refuse to estimate anything from a handful of episodes."""
     if episodes < FEWEST_EPISODES:
-        text = f"{episodes} episodes to evaluate on, expected at least {FEWEST_EPISODES}"
+        text = f"{counted(episodes, 'episode')} to evaluate on, expected at least {FEWEST_EPISODES}"
         raise BadDataSet(f"{data.place}: has {text}. Record more: bam-data collect {data.place} --policy CHECKPOINT")
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from bam_train.files.log_lines import counted
+
 if TYPE_CHECKING:
     from bam_train.estimation.data_evaluation import DataReport
     from bam_train.estimation.estimates import Estimate
@@ -17,7 +19,7 @@ def data_lines(report: DataReport, what: str, place: str) -> Iterator[str]:
     is_rate = report.metric == "success"
     left_out = f", {report.skipped} left out that it learnt from" if report.skipped else ""
     learnt = f", {report.seen} of which it LEARNT FROM" if report.seen else ""
-    yield f"{what} on {place}: {report.episodes} episodes, {report.steps} steps{left_out}{learnt}"
+    yield f"{what} on {place}: {counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}{left_out}{learnt}"
     interval = report.recorded_interval
     recorded = shown(report.recorded, is_rate) + ("" if interval is None else f" ({between(interval, is_rate)})")
     yield f"  recorded  {recorded} {report.metric} of whoever acted"

@@ -25,6 +25,11 @@ def shown(text: str) -> str:
     return text if text.isprintable() else "".join(one if one.isprintable() else repr(one)[1:-1] for one in text)
 
 
+def counted(number: int, what: str) -> str:
+    """``1 episode`` or ``2 episodes``: a number of things, `what` being one of them."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     """Each row as one line, in aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

@@ -91,10 +91,13 @@ def picture(env: gym.Env[Any, Any]) -> Frame:
 
 
 @contextmanager
-def open_video(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
+def open_video(
+    path: Path, rate: float, on_picture: Callable[[int], None] = lambda count: None
+) -> Iterator[Callable[[Frame], None]]:
     """A ``.gif`` or ``.mp4`` video of `rate` pictures a second, to which frames of one size are added.
 
-    The file appears at the end; after an exception there is none.
+    The file appears at the end; after an exception there is none. `on_picture` is called with the number of frames so
+    far.
     """
     count = 0
 
@@ -102,6 +105,7 @@ def open_video(path: Path, rate: float) -> Iterator[Callable[[Frame], None]]:
         nonlocal count
         write(frame)
         count += 1
+        on_picture(count)
 
     try:
         with replacing(path, path.suffix) as temporary, _WRITERS[path.suffix.lower()](temporary, rate) as write:

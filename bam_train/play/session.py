@@ -11,6 +11,7 @@ import numpy as np
 from bam_envs.core.spaces import leaves_by_path
 from bam_train.agent.front.jog import JOG_LIFETIME
 from bam_train.environments import control_period
+from bam_train.files.log_lines import counted
 from bam_train.play.hands import Hand
 from bam_train.play.key_map import moved, next_speed, stick_moved, table
 
@@ -232,7 +233,7 @@ class Session:
         success = self.info.get("is_success")
         self.episodes, self.successes = self.episodes + 1, self.successes + bool(success)
         how = how if success is None else "success" if success else f"no success, {how}"
-        self.status, self.note = "ended", f"{how} after {self.steps} steps, return {self.total:.2f}"
+        self.status, self.note = "ended", f"{how} after {counted(self.steps, 'step')}, return {self.total:.2f}"
         self.keys.release()
         robot: Any = getattr(self.env.unwrapped, "robot", None)
         if self.is_live and robot is not None:
@@ -281,11 +282,7 @@ class Session:
             self._recorder.rewind(count, self.observation)
         self.episodes -= was_over
         self.successes -= was_over and bool(self.info.get("is_success"))
-        self.steps, self.status, self.note = (
-            self.steps - count,
-            "paused",
-            f"{count} step{'s' if count > 1 else ''} undone",
-        )
+        self.steps, self.status, self.note = self.steps - count, "paused", f"{counted(count, 'step')} undone"
         self.keys.release()
         if self.policy is not None:
             self.policy.reset()

@@ -97,10 +97,9 @@ def _status(recording: Recording, axes: Axes) -> None:
 
 
 def _latency(recording: Recording, axes: Axes) -> None:
-    for name in recording.tables["/latency"].names[1:]:
-        values = 1e3 * recording.tables["/latency"].column(name)
+    for name, values in recording.latencies().items():
         if np.isfinite(values).any():
-            axes.plot(_seconds(recording, "/latency"), values, label=name, linewidth=1)
+            axes.plot(_seconds(recording, "/latency"), 1e3 * values, label=name, linewidth=1)
     axes.set_yscale("symlog", linthresh=0.1)
 
 

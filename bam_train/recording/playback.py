@@ -15,6 +15,7 @@ from bam_envs.robots.replay_robot import ReplayRobot
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import environment_of, make_env
 from bam_train.errors import CheckpointMismatch, FormatError
+from bam_train.files.log_lines import counted
 from bam_train.recording.recording import DIGEST, Recording
 
 ROBOT_OPTIONS = ("randomize", "link", "guards", "trial")
@@ -71,7 +72,7 @@ def acts_in(recording: Recording, checkpoint: Checkpoint) -> list[bool]:
     acted, own = recording.policies(), checkpoint.digest[:DIGEST]
     counts = Counter(acted)
     if len(counts) > 1 and own not in counts:
-        others = ", ".join(f"{name or 'unknown'} in {count} ticks" for name, count in counts.items())
+        others = ", ".join(f"{name or 'unknown'} in {counted(count, 'tick')}" for name, count in counts.items())
         raise CheckpointMismatch(checkpoint.path, f"{own} acted in no tick of {recording.path}; there acted {others}")
     return [len(counts) < 2 or name == own for name in acted]
 

@@ -194,6 +194,16 @@ class Recording:
         starts = np.flatnonzero(self.tables["/episode"].column("step") == 0).tolist()
         return [range(start, end) for start, end in zip(starts, [*starts[1:], self.ticks], strict=True)]
 
+    def latencies(self) -> dict[str, Array]:
+        """Times of the stages of each tick [s] by name; NaN where not known, and at the first tick of an episode.
+
+        There the step is the reset, which may be the way to a start pose, and the policy acts for the first time.
+        """
+        if not self.ticks:
+            return {}
+        table, is_first = self.tables["/latency"], self.tables["/episode"].column("step") == 0
+        return {name: np.where(is_first, np.nan, table.column(name)) for name in table.names[1:]}
+
     def arrays(self, kind: str) -> dict[str, NDArray[Any]]:
         """The arrays of ``"observation"``, ``"action"`` or ``"truth"``, (ticks, ...) each; "" names a single one."""
         table = self.tables.get(f"/{kind}")

@@ -60,7 +60,7 @@ def test_a_checkpoint_of_ours(run, checkpoint):
 def test_a_policy_of_another_robot_is_noted(run):
     status, out, err = run(PICK, "--num-episodes", 1)
     assert (status, err) == (0, "policy_from_cp_mir: note: bam/pick-v0 moves a ur5e\n")
-    assert out.splitlines()[-1].endswith(" of 1 episodes on bam/pick-v0")
+    assert out.splitlines()[-1].endswith(" of 1 episode on bam/pick-v0")
 
 
 def test_a_directory_of_rllib_acts_the_same(run, checkpoint, directory, tmp_path):
@@ -80,7 +80,7 @@ def test_checkpoints_of_robo_gyms(run, tmp_path):
     status, expected, err = run(*arguments)
     said = "its spaces are robo-gym's own: NoObstacleNavigationMir100Sim-v0 is made with parity=True"
     assert (status, err) == (0, f"policy_from_cp_mir: warning: {said}\n")
-    assert expected.splitlines()[-1] == "success in 0 of 1 episodes on NoObstacleNavigationMir100Sim-v0"
+    assert expected.splitlines()[-1] == "success in 0 of 1 episode on NoObstacleNavigationMir100Sim-v0"
     assert run(*arguments, "--set", "env_kwargs.parity=true") == (0, expected, "")
 
 

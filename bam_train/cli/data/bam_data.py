@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import count, duration, number, percent, say, tell
+from bam_train.cli.console import count, duration, number, percent, progress, say, tell
 from bam_train.cli.program import Command, run_commands
+from bam_train.files.log_lines import counted
 
 if TYPE_CHECKING:
     from bam_train.cli.data import data_flags as flags
@@ -39,14 +39,12 @@ def collect(config: flags.CollectConfig) -> None:
     from bam_train.data import collect as collecting
     from bam_train.signals import Terminated
 
-    last, kept = time.monotonic(), 0
+    kept, say_done = 0, progress("bam-data", "episode", config.episodes)
 
     def on_progress(done: int, episodes: int) -> None:
-        nonlocal last, kept
+        nonlocal kept
         kept = done
-        if done < episodes and time.monotonic() - last > 5:
-            last = time.monotonic()
-            say(f"bam-data: {done} of {episodes} episodes")
+        say_done(done)
 
     try:
         found = collecting.collect(
@@ -61,8 +59,8 @@ def collect(config: flags.CollectConfig) -> None:
     except KeyboardInterrupt as stop:
         seed = config.seed + max(config.episodes, config.num_envs or 0)  # which no environment had
         text = (
-            f"interrupted: {kept} whole episodes of {config.episodes} are in {config.place}; for the others, run it "
-            f"again with --episodes {config.episodes - kept} --seed {seed}"
+            f"interrupted. Kept in {config.place}: {counted(kept, 'whole episode')} of {config.episodes}; for the "
+            f"others, run it again with --episodes {config.episodes - kept} --seed {seed}"
         )
         if isinstance(stop, Terminated):
             say(f"bam-data: {text}")
@@ -74,13 +72,16 @@ def collect(config: flags.CollectConfig) -> None:
     if found.repeated:
         say(f"bam-data: note: {found.repeated} of them were in {config.place} already: another --seed gives others")
     share = percent(found.successes / found.episodes)
-    tell(f"{config.place}: {found.episodes} episodes, {found.steps} steps added; {share} of them succeeded")
+    tell(
+        f"{config.place}: {counted(found.episodes, 'episode')}, {counted(found.steps, 'step')} added; {share} of "
+        "them succeeded"
+    )
 
 
 def import_(config: flags.ImportConfig) -> None:
     """Add recordings or Parquet rows to a data set."""
     from bam_train.data import DataSet, recordings, rosbags
-    from bam_train.errors import SettingsError
+    from bam_train.errors import BadDataSet, SettingsError
     from bam_train.files.place import Place
     from bam_train.recording.recording import Recording
     from bam_train.settings import read_env_kwargs
@@ -95,23 +96,26 @@ def import_(config: flags.ImportConfig) -> None:
         if rosbags.is_bag(path):
             info = rosbags.info_of_bag(env_kwargs)
             parts = rosbags.episodes_of_bag(path, info, config.profile)
-            notes = recordings.add_episodes(path, parts, config.place, info, **options)
+            found, notes = recordings.add_episodes(path, parts, config.place, info, **options)
         elif recordings.is_rows(path):
             if os.path.abspath(Place(path).path) == os.path.abspath(Place(config.place).path):
                 raise SettingsError(f"{config.place}: has the Parquet rows; give another PLACE for the data set")
             info = recordings.info_of_rows(path, config.env, env_kwargs)
             episodes = recordings.episodes_of_rows(path, info)
-            notes = recordings.add_episodes(path, episodes, config.place, info, **options)
+            found, notes = recordings.add_episodes(path, episodes, config.place, info, **options)
         else:
             recording = Recording.open(path)
             if env_kwargs:
                 raise SettingsError(f"--set: {path} says the arguments of its environment; leave --set out")
             info = recordings.info_of_recording(recording, config.env)
-            notes = recordings.add_recording(recording, config.place, info, **options)
+            found, notes = recordings.add_recording(recording, config.place, info, **options)
+        if not found:
+            why = "".join(f"; {note.removeprefix(f'{path}: ')}" for note in notes)
+            raise BadDataSet(f"{path}: has no whole episode{why}. Leave it out")
         for note in notes:
             say(f"bam-data: note: {note}")
     data = DataSet.open(config.place)
-    tell(f"{config.place}: {len(data)} episodes, {data.total_frames} steps now")
+    tell(f"{config.place}: {counted(len(data), 'episode')}, {counted(data.total_frames, 'step')} now")
 
 
 def check(config: flags.CheckConfig) -> int:
@@ -149,7 +153,7 @@ def check(config: flags.CheckConfig) -> int:
     if found.lost and not (is_mended or config.no_mend):
         say(f"bam-data: nothing was changed. To give up what is lost: bam-data check {config.place} --accept-loss")
     whole = {0: "whole" if found.is_whole else "whole again", 1: "not whole", 3: "whole again, without what is lost"}
-    tell(f"{config.place}: {whole[status]}: {found.episodes} episodes, {found.frames} steps")
+    tell(f"{config.place}: {whole[status]}: {counted(found.episodes, 'episode')}, {counted(found.frames, 'step')}")
     return status
 
 
@@ -161,7 +165,7 @@ def export_data(config: flags.ExportDataConfig) -> None:
     data = _open(config.place)
     chosen = choose(data, config.where)
     opened = export(data, config.to, config.out, chosen)
-    tell(f"{config.out}: {_episodes(len(chosen))} as {config.to}", f"  open it with  {opened}")
+    tell(f"{config.out}: {counted(len(chosen), 'episode')} as {config.to}", f"  open it with  {opened}")
 
 
 def show_info(config: flags.InfoConfig) -> None:
@@ -173,9 +177,11 @@ def show_info(config: flags.InfoConfig) -> None:
     facts = [data.facts(i) for i in range(len(data))]
     dates = sorted(str(one["date"]) for one in facts if "date" in one)
     policies = dict(Counter(str(one["policy"]) for one in facts if "policy" in one).most_common())
+    lost = dict(Counter(str(one["lost"]) for one in facts if "lost" in one))
     if config.json:
         whole = {"place": config.place, "digest": data.digest, **info.to_json(), **(found[0] if found else {})}
-        tell(json.dumps({**whole, "columns": data.features, "policies": policies, "tasks": data.tasks, "dates": dates}))
+        whole |= {"columns": data.features, "policies": policies, "tasks": data.tasks, "dates": dates, "lost": lost}
+        tell(json.dumps(whole))
         return
     spaces = {"observation": info.observation_space, "action": info.action_space}
     lines = [
@@ -187,10 +193,17 @@ def show_info(config: flags.InfoConfig) -> None:
         ("tasks", "; ".join(data.tasks)),
         ("policies", ", ".join(f"{name[:12]} ({times})" for name, times in policies.items()) or "not known"),
         ("recorded", " to ".join(dict.fromkeys((dates[0], dates[-1]))) if dates else "not known"),
+        *(
+            ("lost", f"{what} of {counted(times, 'episode')}, given up with --accept-loss")
+            for what, times in lost.items()
+        ),
         ("digest", data.digest),
     ]
     steps = data.total_frames
-    tell(f"{config.place}: {_episodes(len(data))}, {count(steps)} steps, {duration(steps * info.period)} of the task")
+    tell(
+        f"{config.place}: {counted(len(data), 'episode')}, {count(steps)} steps, {duration(steps * info.period)} of "
+        "the task"
+    )
     for row in found:
         tell(f"  {'success':<12}{_success(row)}; mean return {number(row['mean_return'])}")
     tell(*(f"  {name:<12}{text}" for name, text in lines))
@@ -268,14 +281,17 @@ def show_episode(config: flags.ShowConfig) -> None:
     path = require_video_path(config.out)
     data = _open(config.place)
     _require_episodes(data, "--episode", [config.episode])
-    pictures = 0
-    with open_video(path, 1 / data.info.period) as add:
+    facts, rate = data.facts(config.episode), 1 / data.info.period
+    pictures = facts["length"] + 1
+    with open_video(path, rate, progress("bam-data", "picture", pictures)) as add:
         for frame in frames(data, config.episode, config.camera):
             add(frame)
-            pictures += 1
-    facts = data.facts(config.episode)
     end = {True: "success", False: "failure", None: "success not known"}[facts["success"]]
-    tell(f"{path}: episode {config.episode % len(data)}, {pictures} pictures, return {facts['return']:.4g}, {end}")
+    end += f"; lost: {facts['lost']}" if "lost" in facts else ""
+    tell(
+        f"{path}: episode {config.episode % len(data)}, {counted(pictures, 'picture')}, return "
+        f"{facts['return']:.4g}, {end}"
+    )
 
 
 def _require(given: Sequence[object], what: str) -> None:
@@ -290,17 +306,13 @@ def _require_episodes(data: DataSet, flag: str, indices: Sequence[int]) -> None:
 
     for index in indices:
         if not -len(data) <= index < len(data):
-            raise SettingsError(f"{flag}: {data.place} has {len(data)} episodes, and there is no {index}")
+            raise SettingsError(f"{flag}: {data.place} has {counted(len(data), 'episode')}, and there is no {index}")
 
 
 def _open(place: str) -> DataSet:
     from bam_train.data import DataSet
 
     return DataSet.open(place)
-
-
-def _episodes(how_many: int) -> str:
-    return f"{how_many} episode{'' if how_many == 1 else 's'}"
 
 
 def _copy(data: DataSet, parts: dict[str, Sequence[int]]) -> None:
@@ -311,13 +323,13 @@ def _copy(data: DataSet, parts: dict[str, Sequence[int]]) -> None:
         _tell_added(place, *added)
         others = len({*_open(place).digests} - {data.digests[i] for i in chosen})
         if others:
-            text = f"{place} has {_episodes(others)} from before that this call does not choose"
+            text = f"{place} has {counted(others, 'episode')} from before that this call does not choose"
             say(f"bam-data: note: {text}; if another choice made it, write into a new place")
 
 
 def _tell_added(place: str, added: int, left_out: int) -> None:
     more = f"; {left_out} left out, which are in it already" if left_out else ""
-    tell(f"{place}: {_episodes(added)} added{more}")
+    tell(f"{place}: {counted(added, 'episode')} added{more}")
 
 
 def _success(row: dict[str, Any]) -> str:

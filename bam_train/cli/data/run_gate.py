@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import say, tell
 from bam_train.cli.program import run_program
+from bam_train.files.log_lines import counted
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
@@ -77,7 +78,7 @@ def _lines(simulated: Comparison | None, recorded: DataComparison | None, margin
     if simulated is not None:
         is_rate = simulated.metric == "success"
         last = simulated.seed + simulated.episodes - 1
-        yield f"  simulated   {simulated.env}: {simulated.episodes} pairs, seeds {simulated.seed} to {last}"
+        yield f"  simulated   {simulated.env}: {counted(simulated.episodes, 'pair')}, seeds {simulated.seed} to {last}"
         yield f"    candidate {shown(simulated.candidate, is_rate)} {simulated.metric}"
         yield f"    champion  {shown(simulated.champion, is_rate)} {simulated.metric}"
         what = "only one succeeds" if is_rate else "one has the higher return"
@@ -86,7 +87,7 @@ def _lines(simulated: Comparison | None, recorded: DataComparison | None, margin
         yield f"    verdict   {simulated.verdict}: difference {simulated.difference:+.1%} ({interval})"
     if recorded is not None:
         is_rate = recorded.metric == "success"
-        yield f"  recorded    {recorded.place}: {recorded.episodes} episodes"
+        yield f"  recorded    {recorded.place}: {counted(recorded.episodes, 'episode')}"
         yield f"    candidate {estimate_text(recorded.candidate, is_rate)} {recorded.metric}, estimated"
         yield f"    champion  {estimate_text(recorded.champion, is_rate)} {recorded.metric}, estimated"
         yield f"    verdict   {recorded.verdict}: difference {estimate_text(recorded.difference, is_rate, -1.0)}"

@@ -21,13 +21,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from bam_envs.core.wording import did_you_mean
 from bam_train.cli.console import count, duration, number, percent
 from bam_train.errors import OutputError, SettingsError
 from bam_train.experiments import seed_statistics as statistics
 from bam_train.experiments.run_logs import RunLog, read_runs
 from bam_train.experiments.seed_statistics import FEWEST, METHOD, Interval, estimate
 from bam_train.files.atomic_file import replacing
-from bam_train.files.log_lines import aligned
+from bam_train.files.log_lines import aligned, counted
 from bam_train.settings import differences
 
 Array = NDArray[Any]
@@ -38,6 +39,8 @@ ALIKE = ("seed", "threads", "address", "device")
 """Settings in which runs of one row may differ."""
 INTERVALS = ("score", "difference", "better", "steps", "seconds")
 """Fields of `RowResult` that are intervals."""
+RULES = ("worse", "maybe-worse", "not-better")
+"""Of ``--fail-if``; see `RunComparison.failures`."""
 _FORMS: dict[str, Callable[[float | None], str]] = {"success": percent, "return": number, "score": number}
 _POSITIVE = (0.0, math.inf)
 NO_EVALUATION = "no evaluation is in its log; wait for the first one, or leave this run out"
@@ -254,7 +257,7 @@ class RunComparison:
         FigureCanvasAgg(figure)
         axes = figure.subplots()
         for row, (grid, middle, low, high) in zip(self.rows, lines, strict=True):
-            (line,) = axes.plot(grid, middle, label=f"{row.name} ({len(row.runs)} seeds)")
+            (line,) = axes.plot(grid, middle, label=f"{row.name} ({counted(len(row.runs), 'seed')})")
             if low is not None:
                 axes.fill_between(grid, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
         axes.set_xlabel(across)
@@ -274,11 +277,14 @@ class RunComparison:
         Raises:
             SettingsError: It is no rule, or a row has no interval.
         """
-        match = re.fullmatch(r"(worse|maybe-worse|not-better)(?::(\d+(?:\.\d+)?))?", rule)
-        if match is None or len(self.rows) < 2:
-            expected = "worse, maybe-worse or not-better, such as worse:0.05, and two rows at least"
-            raise SettingsError(f"--fail-if: expected {expected}, found {rule!r} and {len(self.rows)}")
-        kind, margin, lines = match[1], float(match[2] or 0), []
+        kind, _, number = rule.partition(":")
+        if kind not in RULES:
+            raise SettingsError(f"--fail-if: there is no rule {kind!r}. {did_you_mean(kind, RULES)}")
+        if re.fullmatch(rf"{kind}(:\d+(\.\d+)?)?", rule) is None:
+            raise SettingsError(f"--fail-if: expected a margin as in {kind}:0.05, found {rule!r}")
+        if len(self.rows) < 2:
+            raise SettingsError("--fail-if compares with the first FOLDER; give another one too")
+        margin, lines = float(number or 0), []
         for found in self.found[1:]:
             less = found.difference
             if less is None or less.low is None or less.high is None:
@@ -309,7 +315,7 @@ def summary_lines(group: Path) -> list[str]:
         known = [value for run in row.runs if (value := _last(run, metric)) is not None]
         if known:
             score = _shown(estimate(known, row.within(metric)), _FORMS[metric])
-            lines.append(f"{metric} of {len(known)} seeds: interquartile mean {score}")
+            lines.append(f"{metric} of {counted(len(known), 'seed')}: interquartile mean {score}")
     few = f"warning: fewer than {FEWEST} seeds: no interval, and no conclusion"
     return [*lines, few if len(row.runs) < FEWEST else f"interval: {METHOD}", *_origins([row])]
 

@@ -27,6 +27,7 @@ from bam_train.experiments.seed_runs import (
     run_seeds,
 )
 from bam_train.files.atomic_file import replacing
+from bam_train.files.log_lines import counted
 from bam_train.files.place import with_addresses
 from bam_train.settings import RLlibSettings, TrainSettings, read_assignments
 from bam_train.trainers.base import cores
@@ -60,7 +61,7 @@ def train_seeds(config: TrainConfig, text: str, given: Mapping[str, Any]) -> int
         group_folder(runs, settings) as (group, lock),
     ):
         every = [SeedRun.there(group.path, settings, seed, lock) for seed in seeds]
-        say(f"{settings.algo} on {settings.env}, {len(seeds)} seeds in {group.path}, {jobs} at once{where}")
+        say(f"{settings.algo} on {settings.env}, {counted(len(seeds), 'seed')} in {group.path}, {jobs} at once{where}")
         for notice in preset_notices(settings, given):
             say(notice)
         with signals_ask() as stopped:

@@ -27,7 +27,7 @@ from bam_train.experiments.seed_statistics import FEWEST
 from bam_train.experiments.sweep_folder import STATES, SweepFolder
 from bam_train.experiments.trial_search import Sweep, chosen, shown
 from bam_train.files.atomic_file import locked, replacing, require_writable
-from bam_train.files.log_lines import aligned
+from bam_train.files.log_lines import aligned, counted
 from bam_train.settings import (
     NAMES,
     AllSettings,
@@ -91,7 +91,8 @@ def _search(folder: SweepFolder, trials: int, minutes: float | None, address: st
         folder.study.set_user_attr("trials", trials)
     end = float("inf") if minutes is None else time.monotonic() + 60 * minutes
     search = Sweep(folder, trials, say)
-    with _runs(folder, address, track, f"{trials} trials of {folder.seeds} seeds") as (start, jobs, stopped):
+    what = f"{counted(trials, 'trial')} of {counted(folder.seeds, 'seed')}"
+    with _runs(folder, address, track, what) as (start, jobs, stopped):
         display = LiveTable(search.runs) if can_draw() else PlainLines([])
         with contextlib.closing(search), display as table:
 
@@ -124,7 +125,7 @@ def _runs(folder: SweepFolder, address: str | None, track: str | None, what: str
         starter(base, address, folder.path.parent, track) as (start, jobs, where),
         signals_ask() as stopped,
     ):
-        say(f"{base.algo} on {base.env}: {what} in {folder.path}, {jobs} runs at once{where}")
+        say(f"{base.algo} on {base.env}: {what} in {folder.path}, {counted(jobs, 'run')} at once{where}")
         for notice in preset_notices(base, folder.asked):
             say(notice)
         yield start, jobs, stopped
@@ -138,7 +139,8 @@ def _status(folder: SweepFolder) -> list[str]:
     base, best = folder.space.base, folder.best
     counts = {state: len(folder.trials(state)) for state in STATES}
     said = ", ".join(f"{number} {STATES[state]}" for state, number in counts.items() if number)
-    lines = [f"{base.algo} on {base.env}, {folder.seeds} seeds a trial, in {folder.path}: {said or 'no trial'}"]
+    seeds = counted(folder.seeds, "seed")
+    lines = [f"{base.algo} on {base.env}, {seeds} a trial, in {folder.path}: {said or 'no trial'}"]
     if best is None:
         return [*lines, "no trial is done yet"]
     scores = ", ".join(f"{one:.4g}" for one in folder.outcome(best.number).get("scores", ()))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from bam_train.cli.console import say, tell
 from bam_train.cli.program import run_program
 from bam_train.errors import ContractRefused
+from bam_train.files.log_lines import counted
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ def _required(contract: Contract, whose: str, contracts: list[Contract]) -> Find
     except ContractRefused as error:
         raise NotReady(str(error)) from error
     unknown = [line.what for line in contract.checks if line.verdict == "unknown"]
-    return [f"{len(contract.checks)} lines"], [f"unknown: {listed(unknown)}"] if unknown else []
+    return [counted(len(contract.checks), "line")], [f"unknown: {listed(unknown)}"] if unknown else []
 
 
 def _shown(steps: Iterator[DiagnosisStep], config: DoctorConfig) -> Iterator[DiagnosisStep]:

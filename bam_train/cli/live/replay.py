@@ -9,8 +9,9 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import duration, say, tell
+from bam_train.cli.console import duration, progress, say, tell
 from bam_train.cli.program import run_program
+from bam_train.files.log_lines import counted
 
 if TYPE_CHECKING:
     from bam_train.checkpoint import Checkpoint
@@ -84,7 +85,7 @@ def _play(config: ReplayConfig, recording: Recording, checkpoint: Checkpoint) ->
 def _played_lines(played: Playback | None, why: str) -> list[str]:
     if played is None:
         return [f"not played: {why}"]
-    lines = [f"played: the same observation in {played.observations} of {played.ticks} ticks, "]
+    lines = [f"played: the same observation in {played.observations} of {counted(played.ticks, 'tick')}, "]
     lines[0] += f"the same action in {played.actions}" + ("" if played.same else f", at most {played.worst:.3g} apart")
     if played.others:
         others = ", ".join(f"{name} in {count}" for name, count in played.others.items())
@@ -98,8 +99,7 @@ def facts_of(recording: Recording) -> dict[str, Any]:
 
     counts = {guard: recording.guards.count(guard) for guard in sorted(set(recording.guards) - {""})}
     stages = {}
-    for name in recording.tables["/latency"].names[1:] if recording.ticks else ():  # none in an export of bam-data
-        numbers = recording.tables["/latency"].column(name)
+    for name, numbers in recording.latencies().items():
         if len(known := numbers[np.isfinite(numbers)]):
             p50, p99, most = (round(1e3 * float(x), 3) for x in (*np.percentile(known, [50, 99]), known.max()))
             stages[name] = {"p50": p50, "p99": p99, "max": most}
@@ -154,7 +154,7 @@ def lines_of(recording: Recording) -> list[str]:
     marks = f", {metadata['marks']}" if metadata.get("marks") else ""
     lines = [
         f"{recording.path}: {policy if 'checkpoint' in metadata else 'no checkpoint'} on {on}{marks}",
-        f"{recording.ticks} ticks in {duration(facts['seconds'])}, {end}",
+        f"{counted(recording.ticks, 'tick')} in {duration(facts['seconds'])}, {end}",
     ]
     episodes = facts["per_episode"]
     for number, row in enumerate(episodes, 1):
@@ -162,8 +162,10 @@ def lines_of(recording: Recording) -> list[str]:
         if row["end"] == "stopped" and not row["success"]:
             how = "stopped" if recording.complete or number < len(episodes) else "cut off"
         seed = "" if row["seed"] is None else f" (seed {row['seed']})"
-        lines.append(f"episode {number}{seed}: {how} after {row['length']} steps, return {row['return']:.2f}")
-    acted = [f"{guard} in {count} tick{'s' if count > 1 else ''}" for guard, count in facts["guards"].items()]
+        lines.append(
+            f"episode {number}{seed}: {how} after {counted(row['length'], 'step')}, return {row['return']:.2f}"
+        )
+    acted = [f"{guard} in {counted(count, 'tick')}" for guard, count in facts["guards"].items()]
     lines.append(f"guard that acted last: {', '.join(acted)}" if acted else "no guard acted")
     for stage, row in facts["latency_ms"].items():
         lines.append(f"{stage}: p50 {row['p50']:.2f} ms, p99 {row['p99']:.2f} ms, max {row['max']:.2f} ms")
@@ -188,7 +190,8 @@ def _write_video(recording: Recording, checkpoint: Checkpoint | str, named: str 
     recorded = list(islice(frames(recording), 1))
     if not recorded and isinstance(checkpoint, str):
         raise SettingsError(f"no video: {recording.path} has no pictures, and {checkpoint}")
-    with open_video(path, 1 / period) as add:
+    said = progress("bam-replay", "picture", None if recorded else recording.ticks)
+    with open_video(path, 1 / period, said) as add:
         if recorded or isinstance(checkpoint, str):
             for frame in frames(recording):
                 add(frame)
@@ -198,7 +201,7 @@ def _write_video(recording: Recording, checkpoint: Checkpoint | str, named: str 
 
             with closing(replay_env(recording, checkpoint, named, "rgb_array")) as env:
                 play(recording, env, FrozenPolicy.from_checkpoint(checkpoint), lambda: add(picture(env)))
-    say(f"bam-replay: {path}: {recording.ticks} ticks")
+    say(f"bam-replay: {path}: {counted(recording.ticks, 'tick')}")
 
 
 main = partial(run_program, "bam-replay", "bam_train.cli.flags:ReplayConfig", lambda config, _: replay(config))

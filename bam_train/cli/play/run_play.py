@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from bam_train.cli.console import can_draw, say, tell
 from bam_train.cli.program import run_program
 from bam_train.errors import SettingsError
+from bam_train.files.log_lines import counted
 from bam_train.signals import SignalMemory
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def play(config: PlayConfig, signals: SignalMemory) -> int:
         env.close()
         say_agent_rests(env, "bam-play", config.robot)
     recorded = f", recorded in {config.record}" if config.record is not None else ""
-    tell(f"{session.episodes} episode{'' if session.episodes == 1 else 's'}, {session.successes} succeeded{recorded}")
+    tell(f"{counted(session.episodes, 'episode')}, {session.successes} succeeded{recorded}")
     if config.record is not None:
         say(_next_of(str(config.record)))
     return 0

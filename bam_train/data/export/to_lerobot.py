@@ -14,7 +14,7 @@ _FILE_BYTES = 100 * 2**20
 def write(data: DataSet, indices: Sequence[int], path: Path) -> str:
     """Write a data set, which LeRobot opens unchanged; columns that an episode lacks are left out."""
     common = set.intersection(*(set(data.columns_of(index)) for index in indices))
-    with DataSetWriter(path, data.info, flush_episodes=2**31, flush_bytes=_FILE_BYTES) as writer:
+    with DataSetWriter(path, data.info, together=True, flush_episodes=2**31, flush_bytes=_FILE_BYTES) as writer:
         for episode in data.episodes(indices):
             episode.columns = {name: values for name, values in episode.columns.items() if name in common}
             writer.add(episode)

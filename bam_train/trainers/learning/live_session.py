@@ -24,6 +24,7 @@ from bam_train.agent.transitions import decode
 from bam_train.checkpoint import Checkpoint
 from bam_train.environments import require_env_kwargs
 from bam_train.errors import BamTrainError, OutputError, RequestRefused, SettingsError, TrainingFailed
+from bam_train.files.log_lines import counted
 from bam_train.settings import SB3Settings, file_stem, merge
 from bam_train.trainers.best_checkpoint import choose_output
 from bam_train.trainers.learning.live_learner import ALGORITHM, TRAINER, LiveLearner
@@ -163,8 +164,9 @@ class LiveSession:
             rate = figures["success_rate"]
             shown = "unknown" if rate is None else f"{rate:.0%}"
             self._tell(
-                f"{self.learner.steps} steps ({figures['interventions']} of a person), {figures['episodes']} episodes, "
-                f"{figures['updates']} updates; success of the last episodes {shown}"
+                f"{counted(self.learner.steps, 'step')} ({figures['interventions']} of a person), "
+                f"{counted(figures['episodes'], 'episode')}, {counted(figures['updates'], 'update')}; success of the "
+                f"last episodes {shown}"
             )
 
     def _tell_why(self) -> None:

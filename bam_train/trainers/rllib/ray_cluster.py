@@ -27,6 +27,7 @@ import ray
 import ray.rllib  # sets up its loggers
 
 from bam_train.errors import SettingsError, TrainingFailed
+from bam_train.files.log_lines import counted
 from bam_train.settings import RLlibSettings
 from bam_train.signals import at_quit, interrupt, reinstalled, waiting
 from bam_train.trainers.base import cores
@@ -366,11 +367,11 @@ def require_resources(settings: RLlibSettings) -> None:
     wanted = {"CPU": settings.num_env_runners + number * (gpus_each == 0), "GPU": number * gpus_each}
     _require_gpus(settings, wanted["GPU"], int(there.get("GPU", 0)), where)
     if wanted["CPU"] > there.get("CPU", 0):
-        for_what = [_number(settings.num_env_runners, "env runner")] * (settings.num_env_runners > 0)
-        for_what += [_number(number, "learner")] * (number > 0 and not gpus_each)
+        for_what = [counted(settings.num_env_runners, "env runner")] * (settings.num_env_runners > 0)
+        for_what += [counted(number, "learner")] * (number > 0 and not gpus_each)
         add = "add computers with ray start" if joined else "join a cluster with --address"
         raise SettingsError(
-            f"{' and '.join(for_what)} ask for {_number(wanted['CPU'], 'CPU')}, {int(there.get('CPU', 0))} {where}. "
+            f"{' and '.join(for_what)} ask for {counted(wanted['CPU'], 'CPU')}, {int(there.get('CPU', 0))} {where}. "
             f"Lower --num-env-runners or --num-learners, or {add}"
         )
     if joined:
@@ -382,7 +383,7 @@ def _require_gpus(settings: RLlibSettings, wanted: int, there: int, where: str) 
         unset = settings.num_gpus is None
         remedy = f"Set it to {there}, or unset it" if unset else f"Give --num-gpus {there}"
         name = VARIABLE if unset else "num_gpus"
-        raise SettingsError(f"{name}: {_number(wanted, 'GPU')} asked for, {there} {where}. {remedy}")
+        raise SettingsError(f"{name}: {counted(wanted, 'GPU')} asked for, {there} {where}. {remedy}")
 
 
 def _require_free(wanted: dict[str, int]) -> None:
@@ -395,11 +396,7 @@ def _require_free(wanted: dict[str, int]) -> None:
             return
         if time.monotonic() > end:
             raise SettingsError(
-                f"{_number(wanted[name], name)} asked for, and {int(free.get(name, 0))} of the cluster's "
+                f"{counted(wanted[name], name)} asked for, and {int(free.get(name, 0))} of the cluster's "
                 f"{int(ray.cluster_resources()[name])} not in use by others. Ask for less, or wait for them"
             )
         time.sleep(0.2)
-
-
-def _number(number: int, of_what: str) -> str:
-    return f"{number} {of_what}{'' if number == 1 else 's'}"

@@ -24,6 +24,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.data import DataSet
 from bam_train.environments import described, make_env, require_fit
 from bam_train.errors import SettingsError, TrainingFailed
+from bam_train.files.log_lines import counted
 from bam_train.settings import RLlibSettings
 from bam_train.trainers.algorithms import RLLIB_ALGORITHMS
 from bam_train.trainers.base import OnProgress, Progress, Statistics, Trainer
@@ -350,7 +351,7 @@ class RunnerWatch:
             deaths.append(self._update)
             updates = self._update - deaths[0] + 1
             if len(deaths) > MOST_DEATHS and updates <= WINDOW:
-                within = f"{updates} update{'s' if updates > 1 else ''}"
+                within = counted(updates, "update")
                 text = f"env runner {index} died {len(deaths)} times within {within}{self._causes.get(index, '')}"
                 raise TrainingFailed(text, is_kept=True)
         left = len(self._all) - len(self._gone)

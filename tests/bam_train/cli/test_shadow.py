@@ -55,7 +55,7 @@ def test_standing_still_together_says_nothing():
     shadow = Shadow(ARM, Limits())
     arm_tick(shadow, one(0.01), one(0.019))
     assert shadow.agreement == Agreement(None, None, 0, 1)
-    assert shadow.agreement.text == "agreement with whoever drives: nobody moved, nor would the policy, in 1 ticks"
+    assert shadow.agreement.text == "agreement with whoever drives: nobody moved, nor would the policy, in 1 tick"
     assert shadow.agreement.to_json() == {"agreement": None, "interval": None, "ticks": 0, "still": 1}
 
 
@@ -63,7 +63,7 @@ def test_a_robot_that_never_moves_is_driven_by_nobody():
     shadow = Shadow(ARM, Limits())
     arm_tick(shadow, one(0.5), one(0))
     assert shadow.agreement == Agreement(None, None, 1, 0)
-    text = "agreement with whoever drives: nobody drove; the policy would have moved in 1 ticks"
+    text = "agreement with whoever drives: nobody drove; the policy would have moved in 1 tick"
     assert shadow.agreement.text == text
     arm_tick(shadow, one(0.5), one(0.5))
     assert (shadow.agreement.mean, shadow.agreement.ticks) == (0.5, 2)

@@ -187,10 +187,33 @@ def test_without_copies_the_steps_say_what_the_episodes_file_does_not(place, run
         for name in ("observations", "actions", "rewards"):
             assert_same_value(getattr(found, name)[:steps], getattr(written, name)[:steps])
         assert found.columns["guard"].tolist() == [f"g{index}"] * steps
-    assert (data[2].terminated, data[2].facts) == (True, {"lost": "last observation"})
+    assert (data[2].terminated, data[2].facts) == (True, {"lost": "facts and last observation"})
     assert data[2].observations[-1].tolist() == data[2].observations[-2].tolist()
-    assert (data[3].truncated, data[3].facts) == (True, {"lost": "last step"})
+    assert (data[3].truncated, data[3].facts) == (True, {"lost": "facts and last step"})
     assert_same_value(data[3].observations[-1], numbered(3).observations[4])
+
+
+def test_a_column_that_was_given_up_is_said_ever_after(place, run):
+    import pyarrow.parquet as pq
+
+    path = place / DATA.format("001")
+    group = pq.ParquetFile(path).metadata.row_group(1)
+    guard = next(one for one in map(group.column, range(group.num_columns)) if one.path_in_schema == "guard")
+    data = bytearray(path.read_bytes())
+    data[guard.data_page_offset + guard.total_compressed_size // 2] ^= 1
+    path.write_bytes(data)
+    what = f"{DATA.format('001')}: the column guard of episode 3"
+    assert f"lost: {what}" in check(place, run, "--accept-loss")[1]
+    assert check(place, run) == (0, [f"note: given up before: {what}"], "whole: 6 episodes, 27 steps")
+    given_up = "  lost        column guard of 1 episode, given up with --accept-loss\n"
+    assert given_up in run(bam_data.main, "info", place)[1]
+    assert json.loads(run(bam_data.main, "info", place, "--json")[1])["lost"] == {"column guard": 1}
+    data = DataSet.open(place)
+    assert (data.facts(3)["lost"], data.columns_of(3), data.columns_of(2)) == (
+        "column guard",
+        ["time"],
+        ["time", "guard"],
+    )
 
 
 def test_a_damaged_copy_costs_nothing(place, run):

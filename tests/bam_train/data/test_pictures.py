@@ -57,13 +57,15 @@ def test_what_cannot_be_drawn(tmp_path, run):
     )
 
 
-def test_a_film_of_recorded_pictures(tmp_path, run):
+def test_a_film_of_recorded_pictures(tmp_path, run, monkeypatch):
     pytest.importorskip("PIL")
     data = record(tmp_path / "a", "nested", 3)
     found = list(frames(data, 1, "camera"))
     np.testing.assert_array_equal(found, data[1].observations["camera"])
-    status, out, _ = run(main, "show", tmp_path / "a", "--episode", "-2", "--out", tmp_path / "new" / "e.gif")
+    monkeypatch.setattr("bam_train.cli.console._BETWEEN", -1.0)  # as if each picture took long
+    status, out, err = run(main, "show", tmp_path / "a", "--episode", "-2", "--out", tmp_path / "new" / "e.gif")
     assert (status, out.partition(", return")[0]) == (0, f"{tmp_path}/new/e.gif: episode 1, 5 pictures")
+    assert err == "".join(f"bam-data: {done} of 5 pictures\n" for done in range(1, 5))
     with pytest.raises(SettingsError, match="has no 'kamera'"):
         next(frames(data, 0, "kamera"))
     status, _, err = run(main, "show", tmp_path / "a", "--episode", "3", "--out", tmp_path / "e.gif")

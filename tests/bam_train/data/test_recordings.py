@@ -9,6 +9,7 @@ from bam_train.cli import eval as evaluation
 from bam_train.cli.data import bam_data
 from bam_train.data import DataSet
 from bam_train.data.recordings import is_data_set
+from bam_train.recording.recorder import Recorder
 
 pytest.importorskip("mujoco")
 pytest.importorskip("pyarrow")
@@ -71,12 +72,25 @@ def test_recordings_are_imported_once_and_up_to_their_cut(folder, capsys):
         status = run(bam_data.main, "import", place, cut, "--group", "cell-7", "--task", "reach it")
         shown = capsys.readouterr()
         assert (status, len(shown.err.splitlines()) <= 1) in ((0, True), (1, True))
+        assert place.exists() == (status == 0)
         for index, one in enumerate(DataSet.open(place) if status == 0 else ()):
             assert one.observations.tobytes() == whole[index].observations[: len(one) + 1].tobytes()
             assert one.actions.tobytes() == whole[index].actions[: len(one)].tobytes()
             assert (one.facts["group"], one.facts["task"]) == ("cell-7", "reach it")
             assert (one.digest == whole[index].digest) == ("end" not in one.facts)
             assert ("end" in one.facts) == one.truncated
+
+
+def test_a_recording_without_an_episode_is_one_line_and_leaves_nothing(folder, capsys):
+    recorder = Recorder(folder / "none.mcap", {"env": "bam/reach-v0"})
+    recorder.start()
+    assert recorder.close() == ""
+    before = DataSet.open(folder / "deployed").digest
+    for place in ("made", "deployed"):
+        assert run(bam_data.main, "import", folder / place, recorder.path) == 1
+        assert capsys.readouterr().err == f"bam-data import: {recorder.path}: has no whole episode. Leave it out\n"
+    assert not (folder / "made").exists()
+    assert DataSet.open(folder / "deployed").digest == before
 
 
 def test_what_is_a_data_set(tmp_path):

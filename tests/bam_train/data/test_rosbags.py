@@ -126,7 +126,7 @@ def test_images_are_in_the_size_of_the_environment_and_a_bag_counts_once(arm, tm
     assert (front[:, :, :15] == 200).all()
     assert (front[:, :, 17:] == 0).all()
     status, out, err = arm(folder, flags=flags)
-    assert (status, out) == (0, f"{tmp_path / 'data'}: 1 episodes, {len(episode)} steps now\n")
+    assert (status, out) == (0, f"{tmp_path / 'data'}: 1 episode, {len(episode)} steps now\n")
     assert err.endswith(f"is in {tmp_path / 'data'} already; bam-data import --again adds it all the same\n")
 
 

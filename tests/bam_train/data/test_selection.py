@@ -6,8 +6,9 @@ import pytest
 
 from bam_train.cli.data.bam_data import main
 from bam_train.data import DataSet, DataSetInfo, DataSetWriter
+from bam_train.data.layout import Files
 from bam_train.data.selection import choose, copy_episodes, merge, split
-from bam_train.errors import BadDataSet, SettingsError
+from bam_train.errors import BadDataSet, PlaceError, SettingsError
 from tests.bam_train.data.export.test_export import SPACES, record
 
 
@@ -42,6 +43,45 @@ def test_others_are_not_merged(change, what, tmp_path):
     with pytest.raises(BadDataSet, match=f"a: {what}.*b; merge .*b into another place$"):
         merge([a, DataSet.open(tmp_path / "b")], tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_split_that_is_cut_off_leaves_both_places_as_they_were(tmp_path, monkeypatch):
+    """Every write of it can be the last one: into one place that is new, and one that has episodes."""
+    data, kept = record(tmp_path / "a", count=9), record(tmp_path / "old", count=2)
+    parts = {str(tmp_path / "new"): [4, 5, 6], kept.place: [2, 3]}
+    before = contents(tmp_path)
+    write, count, done = Files.write, 0, False
+    while not done:
+        count += 1
+        left = [count]
+
+        error = (KeyboardInterrupt, PlaceError("disk", "no space"))[count % 2]
+
+        def write_some(self, name, content, left=left, error=error):
+            left[0] -= 1
+            if not left[0]:
+                raise error
+            write(self, name, content)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Files, "write", write_some)
+            try:
+                assert copy_episodes(data, parts) == [(3, 0), (2, 0)]
+                done = True
+            except (KeyboardInterrupt, PlaceError):
+                assert contents(tmp_path) == before, count
+    assert count > 12
+    assert DataSet.open(kept.place).digests == [*kept.digests, *data.digests[2:4]]
+    assert [one.facts["seed"] for one in DataSet.open(tmp_path / "new")] == [4, 5, 6]
+
+
+def contents(folder):
+    """All files, without the locks of data sets, and all folders."""
+    return {
+        path: path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+        if path.name != ".writer"
+    }
 
 
 def test_conditions(tmp_path):

@@ -186,6 +186,9 @@ def test_summary_for_people_and_programs(pick, capsys):
     assert report["played"] == {**counts, "worst": 0.0, "others": {}, "same": True}
     assert [row["length"] for row in report["per_episode"]] == [*STEPS]
     assert report["complete"] is True
+    tables = Recording.open(pick).tables
+    times = 1e3 * tables["/latency"].column("step")[tables["/episode"].column("step") > 0]  # resets are no steps
+    assert report["latency_ms"]["step"]["max"] == round(float(times.max()), 3)
 
 
 def test_an_environment_without_a_robot(corridor_checkpoint, tmp_path, capsys):
@@ -303,12 +306,15 @@ def test_somebody_elses_mcap_file_is_refused(tmp_path, topic, content):
 def test_a_recording_is_drawn(small_chunks, tmp_path, capsys, monkeypatch):
     titles = []
     monkeypatch.setattr(Axes, "set_ylabel", lambda axes, text, **_: titles.append(text))
+    monkeypatch.setattr("bam_train.cli.console._BETWEEN", -1.0)  # as if each picture took long
     plot, video, cut = tmp_path / "new" / "a.png", tmp_path / "new" / "too" / "a.gif", tmp_path / "cut.mcap"
     cut.write_bytes(small_chunks[:20_000])
     ticks = Recording.open(cut).ticks
     assert 3 < ticks < 15
     assert call(replay, cut, "--plot", plot, "--video", video) == 0
-    assert capsys.readouterr().err.splitlines() == [f"bam-replay: {plot}: drawn", f"bam-replay: {video}: {ticks} ticks"]
+    slow = [f"bam-replay: {done} of {ticks} pictures" for done in range(1, ticks)]
+    said = [f"bam-replay: {plot}: drawn", *slow, f"bam-replay: {video}: {ticks} ticks"]
+    assert capsys.readouterr().err.splitlines() == said
     quantities = ["joint_position [rad]", "joint_velocity [rad/s]", "gripper_width [m]", "object_position [m]"]
     others = ["object_quaternion", "command [rad, m]", "action", "status", "latency [ms]"]
     assert titles == quantities + others

@@ -50,6 +50,7 @@ _REMEDIES = {
     "Unrecognized XML model type": "give an MJCF or URDF file; a part of one is read through the file that includes it",
 }
 """What to do about a file that MuJoCo refuses, by words in its text."""
+_DIVERGED = tuple(int(getattr(mujoco.mjtWarning, f"mjWARN_BADQ{one}")) for one in ("POS", "VEL", "ACC"))
 _SETTLING = 2.0  # time for a linkage to come to rest [s]
 _ABOVE = 4  # folders above a xacro file beside which its packages are looked for
 _JAW = re.compile("jaw|grip|finger|claw", re.IGNORECASE)
@@ -716,6 +717,11 @@ class _Reader:
                 for _ in range(int(_SETTLING / model.opt.timestep)):
                     data.qpos[held], data.qvel[still] = 0.0, 0.0
                     mujoco.mj_step(model, data)
+                if any(data.warning[kind].number for kind in _DIVERGED):
+                    raise InvalidValue(
+                        f"{self._where}: its gripper, simulated, does not come to rest: give its actuator less gain, "
+                        "or --gripper parallel:WIDTH instead."
+                    )
                 data.qpos[held] = 0.0
                 yield data.qpos.copy()
             return

@@ -7,8 +7,10 @@ an environment in a batch equals the same one alone, bit for bit.
 
 import copy
 import importlib
+import logging
 import math
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,8 @@ except RuntimeError as refused:
         f"MuJoCo cannot be imported: {refused}. Unset MUJOCO_GL, or set it to egl or osmesa."
     ) from refused
 rollout: Any = importlib.import_module("mujoco.rollout")
+if mujoco.get_mju_user_warning() is None:  # else it prints them, and writes MUJOCO_LOG.TXT where the program runs
+    mujoco.set_mju_user_warning(partial(logging.getLogger(__name__).info, "%s"))
 Array = NDArray[np.float64]
 FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 MODELS = Path(__file__).parent / "models"

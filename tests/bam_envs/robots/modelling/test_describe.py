@@ -506,14 +506,25 @@ def test_a_model_that_cannot_work_is_one_line(tmp_path, model, gripper, site, me
             HAND.replace("<worldbody>", '<option foo="1"/><worldbody>'),
             REFUSED,
         ),
+        (
+            HAND.replace(
+                "</mujoco>",
+                '<equality><joint joint1="finger1" joint2="finger2"/></equality>'
+                '<actuator><position joint="finger1" kp="1e15" ctrlrange="0 0.04"/></actuator></mujoco>',
+            ),
+            "ARM: its gripper, simulated, does not come to rest: give its actuator less gain, or "
+            "--gripper parallel:WIDTH instead.",
+        ),
     ],
 )
-def test_a_gripper_that_cannot_work_is_one_line(folder, tmp_path, text, message):
+def test_a_gripper_that_cannot_work_is_one_line(folder, tmp_path, capfd, monkeypatch, text, message):
+    monkeypatch.chdir(tmp_path)  # where MuJoCo's own warnings would go, as they would to standard error
     path = tmp_path / "hand.xml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InvalidValue) as caught:
         describe("lab", str(folder / "seven.xml"), str(path), None)
-    assert str(caught.value) == message.format(path)
+    assert str(caught.value) == message.format(path).replace("ARM", str(folder / "seven.xml"))
+    assert (capfd.readouterr(), [one.name for one in tmp_path.iterdir()]) == (("", ""), ["hand.xml"])
 
 
 def test_a_mesh_that_mujoco_does_not_read_is_converted(tmp_path):

@@ -136,7 +136,6 @@ def test_what_is_refused(run, rows, here):
     (here / "begun" / "seed-0" / "outcome.json").unlink()
     (here / "new").mkdir()
     (here / "new" / "progress.jsonl").touch()
-    rule = "--fail-if: expected worse, maybe-worse or not-better, such as worse:0.05, and two rows at least, found "
     for words, line in (
         ([], "FOLDER is missing: give a folder of runs for each row, such as runs/pick-ppo"),
         (
@@ -152,8 +151,9 @@ def test_what_is_refused(run, rows, here):
             ["ppo", "begun", "--metric", "score"],
             "begun/seed-0: score is not in its log; compare its success or return with --metric",
         ),
-        (["ppo", "sac", "--fail-if", "bad"], f"{rule}'bad' and 2"),
-        (["ppo", "--fail-if", "worse"], f"{rule}'worse' and 1"),
+        (["ppo", "sac", "--fail-if", "worst:0.1"], "--fail-if: there is no rule 'worst'. Did you mean 'worse'?"),
+        (["ppo", "sac", "--fail-if", "worse:x"], "--fail-if: expected a margin as in worse:0.05, found 'worse:x'"),
+        (["ppo", "--fail-if", "worse"], "--fail-if compares with the first FOLDER; give another one too"),
     ):
         assert run(main, *words) == (1, "", f"bam-compare: {line}\n")
 

@@ -150,7 +150,7 @@ def test_a_search_from_a_file_and_what_a_second_call_does(run, trained):
     status, out, err = run(main, "sweep.toml")
     assert status == 0
     lines = err.splitlines()
-    assert lines[0] == f"ppo on test/Corridor-v0: 12 trials of 2 seeds in {FOLDER}, 1 runs at once"
+    assert lines[0] == f"ppo on test/Corridor-v0: 12 trials of 2 seeds in {FOLDER}, 1 run at once"
     folder = SweepFolder(FOLDER, {}, None, begun=True)
     sizes = {one.number: int(one.params["hyperparameters.n_steps"]) for one in folder.trials()}
     assert {64, 128, 256, 512} == {*sizes.values()}
