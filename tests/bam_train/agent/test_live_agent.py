@@ -170,6 +170,7 @@ def test_a_program_takes_over_and_hands_back(running):
         observation, *_ = env.step(policy.act(observation))
     env.close()
     status = running.state("paused")
+    assert all(row["altered"] <= 5 for row in env.unwrapped.robot.agent_guards.values())  # of its commands alone
     assert (status["owner"], status["why"].split(" by ")[0]) == (None, "handed back")
     running.run()
     assert running.state()["stage"] == "full"
