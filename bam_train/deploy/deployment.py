@@ -279,8 +279,9 @@ def excuse_of(error: Exception, robot: Any, times: TickTimes) -> str:
         robot: The robot, behind its guards.
         times: Of the last ticks.
     """
-    if isinstance(error, SafetyStop) or getattr(robot, "stopped", None) is not None:
-        return times.excuse(by_time=getattr(robot, "code", 0) in TIMING_GUARDS)
+    is_ours = getattr(robot, "stopped", None) is not None
+    if is_ours or isinstance(error, SafetyStop):  # else by a guard of the live agent there
+        return times.excuse(by_time=is_ours and robot.code in TIMING_GUARDS)
     if isinstance(error, LinkLost):
         return "the link to the robot was lost"
     return "somebody else drives the robot" if isinstance(error, NotInCommand) else ""

@@ -211,7 +211,7 @@ def test_an_episode_that_is_cut_short_has_failed_unless_a_link_or_a_busy_compute
     """By the rule of the live agent."""
     clock = SimpleNamespace(time=0.0)
     env = Driven(gym.make(corridor, slow=True, max_episode_steps=-1), raises(error), at=25)
-    env.robot.code = guard
+    env.robot.code, env.robot.stopped = guard, "following (G23)" if isinstance(error, SafetyStop) else None
 
     def sleep(seconds):
         clock.time += seconds + late
