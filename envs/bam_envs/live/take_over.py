@@ -107,10 +107,12 @@ def _counts(answer: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _since(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """What each guard that acted has counted since `before`."""
+    """What each guard that acted has counted since `before`; all of it if the agent has connected its robot anew."""
     acted = dict[str, dict[str, Any]]()
     for name, row in after.items():
-        new = {what: row[what] - before.get(name, {}).get(what, 0) for what in COUNTED}
-        if any(count > 0 for count in new.values()):
+        earlier = before.get(name, {})
+        new = {what: row[what] - earlier.get(what, 0) for what in COUNTED}
+        new = new if min(new.values()) >= 0 else {what: row[what] for what in COUNTED}
+        if any(new.values()):
             acted[name] = {"number": row["number"], **new}
     return acted

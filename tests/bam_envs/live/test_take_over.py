@@ -21,6 +21,7 @@ def row(number, altered, held=0, stopped=0):
             {"joint speed": row("G8", 43), "following": row("G23", 0, 2, 1), "jerk": row("G9", 3)},
             {"joint speed": row("G8", 3), "following": row("G23", 0, 2, 1)},
         ),
+        ({"jerk": row("G9", 9, 4)}, {"jerk": row("G9", 2, 6)}, {"jerk": row("G9", 2, 6)}),  # connected anew meanwhile
         (None, None, {}),  # of an agent that does not tell them
     ],
 )
