@@ -118,7 +118,7 @@ def learn(name: str, args: argparse.Namespace) -> None:
             while not done:
                 before, action = after, policy.act_batch(after[None])[0]
                 after, reward, *ends, info = env.step(action)
-                log.add(before, action, reward, after, *ends, bool(info["is_success"]), person, episode, step, "")
+                log.add(before, action, reward, after, *ends, bool(info.get("is_success")), person, episode, step, "")
                 step, done = step + 1, any(ends)
             if (transitions := log.take()) is not None:
                 learner.add(transitions)

@@ -24,7 +24,6 @@ import numpy as np
 from bam_envs import __version__
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, NotReady, RemoteError, SafetyStop
 from bam_envs.core.robot import Initial
-from bam_envs.safety.guard import TIMING_GUARDS
 from bam_train.agent.agent_messages import Answer, Ask, Drive, Halt, Message, Report, Rows, Sent
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.agent_states import TRANSITIONS, State
@@ -33,7 +32,7 @@ from bam_train.agent.succession import Choice, Succession
 from bam_train.agent.transitions import TransitionCollector, TransitionLog, encode
 from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
-from bam_train.deploy.deployment import Stopped, StopSwitch, fault_text
+from bam_train.deploy.deployment import Stopped, StopSwitch, excuse_of, fault_text
 from bam_train.deploy.episode import EpisodeStep
 from bam_train.deploy.journal import LATE, EpisodeRecord
 from bam_train.errors import BamTrainError, ContractRefused, FormatError, PolicyError, RequestRefused, kind_of
@@ -341,13 +340,9 @@ class Resident:
 
     def _judge(self, session: RobotSession, record: EpisodeRecord, error: Exception) -> None:
         """Judge the policy whose episode ended with `error`: by a stop of a guard, or by the loss of the link."""
-        if self._stopped:
-            excuse = session.deployment.times.excuse(by_time=session.robot.code in TIMING_GUARDS)
+        excuse = excuse_of(error, session.robot, session.deployment.times)
+        if self._stopped or excuse:
             self.succession.cut_short(record, self._stopped, excuse)
-        elif isinstance(error, LinkLost):
-            self.succession.cut_short(record, excuse="the link to the robot was lost")
-        elif isinstance(error, NotInCommand):
-            self.succession.cut_short(record, excuse="somebody else drives the robot")
 
     @property
     def _why_cut_short(self) -> str:

@@ -134,6 +134,11 @@ class RobotSession:
         """The task."""
         return self._env.unwrapped.task
 
+    @property
+    def says_success(self) -> bool:
+        """Whether the environment reports success, which trials need."""
+        return bool(getattr(self._env.unwrapped, "says_success", True))
+
     def goals(self) -> list[list[float]]:
         """Where the task of the episode goes: x, y, z of each goal [m]."""
         begun = self.deployment.journal.begun

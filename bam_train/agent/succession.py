@@ -233,6 +233,11 @@ class Succession:
         """Let `version` act as the request says, and wait until it does."""
         resident, arguments = self._resident, ask.arguments
         choice = self._made(version, ask, session)
+        if arguments.get("wait") and choice.trials is not None and not session.says_success:
+            raise RequestRefused(
+                f"{session.env_id} reports no success, so that no trial here decides: do the trials with bam-deploy "
+                "--stage trial, then push with --stage full"
+            )
         when = "tick" if choice.at_once else "episode"
         news = f"it acts from the next {when} on"
         if resident.state is State.TAKEN_OVER:

@@ -86,6 +86,9 @@ def connected_env(
         known = "" if contract is None else contract.identity
         is_shadow = isinstance(place, LiveRobot) and place.stage == "shadow"
         plan = [*plan_lines(env, env_id, place.text, episodes, wiggle=wiggle), *admit(env, place, known)]
+        if isinstance(place, LiveRobot) and place.stage == "trial" and not getattr(env.unwrapped, "says_success", True):
+            asks = "nobody is asked (--yes), and no trial counts" if yes else "you are asked after each episode"
+            plan.append(f"  {env_id} does not say whether an episode succeeded: {asks}")
         signals.raise_again()
         if not is_shadow:
             actor = "a person" if checkpoint is None else checkpoint.path

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json as json_module
 import math
 import pkgutil
+import sys
 from contextlib import nullcontext
 from functools import partial
 from importlib import import_module
@@ -101,6 +102,7 @@ def _run(
     seed: int,
 ) -> int:
     """Run the deployment and report it, also after a signal; returns the exit status."""
+    from bam_envs.core.robot_env import robot_of
     from bam_train.cli.consent import guards_of, say_agent_rests
     from bam_train.cli.deploy_display import PlainDeployment, live_display
     from bam_train.deploy.journal import DeployReport
@@ -111,12 +113,15 @@ def _run(
         deployment.switch.came += signals.came  # after a lost exception, the deployment ends before it begins
         plain = nullcontext(PlainDeployment(journal, say))
         with live_display(make_console(), env, title, journal) if can_draw() else plain as watcher:
+            if not config.yes and sys.stdin.isatty():
+                deployment.judge = watcher.judge
             ending = deployment.run(watcher, seed=seed)
         if ending.status:
             say(f"bam-deploy: {ending.reason}")
         where = place.text or "simulated here"
         facts: Any = {"guards": guards_of(env), "trials": deployment.trials, "recorder": deployment.recorder}
-        facts |= {"shadow": admission.shadow, "identity": admission.identity}
+        facts |= {"shadow": admission.shadow, "identity": admission.identity, "uncounted": deployment.uncounted}
+        facts["agent_guards"] = getattr(robot_of(env), "agent_guards", {})
         report = DeployReport(checkpoint, seed, ending, journal, pacer, where, **facts)
         for warning in (one for one in report.warnings() if not watcher.has_written(one)):
             say(f"bam-deploy: warning: {warning}")

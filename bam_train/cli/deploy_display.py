@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import zip_longest
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.live import Live
 
+_ASKED = 3
+"""How often the operator is asked for a yes or no."""
 _MOST_NUMBERS = 16
 """Numbers of an action or a state signal that are shown; the rest (of an image, say) is left out."""
 
@@ -48,6 +51,17 @@ class PlainDeployment:
         which = f"episode {self._journal.begun}/{self._journal.wanted} (seed {record.seed})"
         self._write(f"{which}: {how} after {steps}, return {record.total:.2f}{self._journal.marked}")
 
+    def judge(self, record: EpisodeRecord) -> bool | None:
+        """Ask the operator whether the policy did its task, which the environment does not say; None: no answer."""
+        for _ in range(_ASKED):
+            self._write(f"Did it do its task in the episode with seed {record.seed}? Type yes or no:")
+            if (answer := self._typed()) in ("yes", "no"):
+                return answer == "yes"
+        return None
+
+    def _typed(self) -> str:
+        return sys.stdin.readline().strip().lower()
+
 
 class LiveDeployment(PlainDeployment):
     """A panel below those lines, redrawn ten times a second at most, and only when there is time until a deadline.
@@ -70,6 +84,14 @@ class LiveDeployment(PlainDeployment):
     ) -> None:
         super().__init__(journal, lambda line: live.console.print(rich_text(line)))
         self._live, self._env, self._title, self._now, self._drawn = live, env, title, now, -math.inf
+
+    def _typed(self) -> str:
+        from rich.control import Control
+        from rich.segment import ControlType
+
+        typed = super()._typed()
+        self._live.console.control(Control((ControlType.CURSOR_UP, 1)))  # back to the last line of the panel
+        return typed
 
     def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
         """As there, and redraw if it is time and there is time."""

@@ -243,15 +243,12 @@ def _foreign(config: EvalConfig, path: Path) -> _Subject:
 def _table(report: EvaluationReport, subject: _Subject, path: Path) -> list[str]:
     """The report for people, line by line."""
     from bam_envs.core.wording import brief
+    from bam_train.evaluation import success_text
 
     kwargs = subject.env_kwargs
     if isinstance(arm := kwargs.get("robot_model"), dict):  # a whole description
         kwargs = {**kwargs, "robot_model": arm["name"]}
     given = ", ".join(f"{name}={brief(value)}" for name, value in kwargs.items())
-    success = "unknown: the environment does not report is_success"
-    if report.success_rate is not None and report.success_interval is not None:
-        interval = "95 % interval {:.1%} to {:.1%}".format(*report.success_interval)
-        success = f"{report.success_rate:.1%} ({report.successes} of {report.episodes}; {interval})"
     returns = "not finite" if report.return_std is None else f"{report.return_mean:.2f} ± {report.return_std:.2f}"
     extremes = "range not finite"
     if report.return_min is not None and report.return_max is not None:
@@ -263,7 +260,7 @@ def _table(report: EvaluationReport, subject: _Subject, path: Path) -> list[str]
         seeds = f"{all_of_them} different starts, none of them twice"
     return [
         what + (f" with {given}" if given else ""),
-        f"  success   {success}",
+        f"  success   {success_text(report.successes, report.episodes)}",
         f"  return    {returns}, {extremes}",
         f"  length    {report.length_mean:.2f} ± {report.length_std:.2f} steps",
         f"  episodes  {report.episodes}, {seeds}",

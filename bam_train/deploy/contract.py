@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bam_envs.core.kinematics import ArmGeometry
-from bam_envs.core.location import LiveRobot
+from bam_envs.core.location import LiveRobot, serving
 from bam_envs.live.arm_checks import arm_checks, arm_in, described_checks
 from bam_envs.live.bringup import TIMEOUT
 from bam_envs.live.examination import Inspection, inspect_robot
@@ -22,6 +22,7 @@ from bam_train.checkpoint import Checkpoint
 from bam_train.environments import first_difference, fit_pairs
 from bam_train.errors import ContractRefused
 
+_RETRAIN = "train the policy anew, or use the version, and the arm (--robot-model), that it was trained with"
 _WIDEST = 60
 """Maximum width of a column, so that a long text does not widen the table [characters]."""
 
@@ -33,6 +34,8 @@ class Contract:
     checks: tuple[Check, ...]
     inspection: Inspection | None = field(default=None, repr=False)
     """The messages of the robot that were compared."""
+    stand_in: str = ""
+    """The command that serves a simulated robot for the environment."""
 
     @property
     def identity(self) -> str:
@@ -89,12 +92,19 @@ class Contract:
             raise ContractRefused(first.what, text, passes=all(line.passes for line in self.refused))
 
     def _remedy(self) -> str:
-        """What to do about a refused line; a robot that is another one needs another policy."""
-        info = None if self.inspection is None else self.inspection.info
-        if self.inspection is None or info is None or info.name == self.inspection.profile.name:
-            return "correct the robot or its profile"
-        own = self.inspection.profile.name
-        return f"the robot there is {info.name}, and the policy is for {own}: give the address of {own}, or its profile"
+        """What to do about the first refused line; a robot that describes itself takes no other profile."""
+        first, found = self.refused[0], self.inspection
+        if first.remedy or found is None or found.info is None:
+            return first.remedy or "correct the robot or its profile"
+        info, own = found.info, found.profile.name
+        if info.name != own:
+            theirs = f"the robot there is {info.name}, and the policy is for {own}"
+            return f"{theirs}: give the address of {own}, or a policy for {info.name}"
+        if first.passes and info.simulated:
+            return "the computer that simulates the robot is slow or busy: end other programs there, and run it again"
+        if info.agent:
+            return "give a policy for the environment of the live agent there"
+        return f"start the robot with {self.stand_in}" if info.simulated and self.stand_in else "correct the robot"
 
 
 def check_contract(
@@ -128,7 +138,9 @@ def check_contract(
 
 def contract_with(checkpoint: Checkpoint, env: Any, inspection: Inspection) -> Contract:
     """The lines of the checkpoint, and those of the robot as inspected; `env` is the checkpoint's environment."""
-    return Contract((*fit_checks(checkpoint, env), *live_checks(env, inspection)), inspection)
+    spec = env.spec
+    stand_in = "" if spec is None else serving(spec.id, spec.kwargs.get("robot_model"))
+    return Contract((*fit_checks(checkpoint, env), *live_checks(env, inspection)), inspection, stand_in)
 
 
 def live_checks(env: Any, inspection: Inspection) -> Iterator[Check]:
@@ -152,7 +164,7 @@ def fit_checks(checkpoint: Checkpoint, env: Any) -> Iterator[Check]:
             yield Check(what, _in_short(saved), _in_short(present), fits=True)
         else:
             at, expected, found = difference
-            yield Check(f"{what}{at}", expected, found, fits=False)
+            yield Check(f"{what}{at}", expected, found, fits=False, remedy=_RETRAIN)
 
 
 def _in_short(value: Any) -> str:

@@ -20,7 +20,7 @@ from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, SafetySto
 from bam_envs.core.robot import RobotState
 from bam_envs.core.robot_env import halt_and_close, robot_of
 from bam_envs.core.timing import Pacer, TickTimes
-from bam_envs.safety.guard import Tick
+from bam_envs.safety.guard import TIMING_GUARDS, Tick
 from bam_train.checkpoint.detector import vectors
 from bam_train.deploy.episode import EpisodeLoop, EpisodeStep, Watcher
 from bam_train.deploy.flight import FlightLog
@@ -109,6 +109,10 @@ class Deployment:
         self._loop = EpisodeLoop(
             env, self._beside(policy), pacer, journal, raise_again=self.switch.raise_again, between_ticks=between_ticks
         )
+        self.judge: Callable[[EpisodeRecord], bool | None] = lambda record: None
+        """Called after a trial whose environment reports no success; whether it succeeded, None if nobody says."""
+        self.uncounted = ""
+        """Why the last trial does not count, in one line; "" if it does, or if a person ended it."""
         self._closing = self._closed = False
         self._flight = FlightLog(recorder, env, journal)
         self._loop.observers += [*observers, _Comparison(env, self._loop, journal), self._flight.record]
@@ -168,9 +172,18 @@ class Deployment:
                 self._loop.policy.reset()  # nothing that it has planned is sent
         self._halt()  # the sink and the next reset may be slow
         if self.trials is not None and record.end != "stopped":
-            self.trials.end(record.success is True, record.end)
+            self._end_trial(self.trials, record)
         self._flush()
         return record
+
+    def _end_trial(self, trials: Trials, record: EpisodeRecord) -> None:
+        """Record the trial of a whole episode; one of which nobody knows whether it succeeded does not count."""
+        if record.success is None and (success := self.judge(record)) is not None:
+            self.journal.judged(record, success)
+            if self.recorder is not None:
+                self.recorder.event(f"the operator says: {'a success' if success else 'no success'}")
+        self.uncounted = "nobody said whether it succeeded" if record.success is None else ""
+        trials.end(record.success is True, self.uncounted or record.end, void=record.success is None)
 
     def _begins(self, seed: int) -> None:
         if self.trials is not None:
@@ -222,7 +235,7 @@ class Deployment:
             self.recorder.close()
 
     def _run(self, watcher: Watcher, seed: int) -> Ending:
-        by_person = False
+        by_person, excuse = False, ""
         try:
             try:
                 self.switch.armed = True
@@ -235,15 +248,15 @@ class Deployment:
         except Stopped:
             ending, by_person = Ending("interrupted", 128 + self.switch.came[0]), True
         except Exception as error:  # after any fault, the robot must be halted and the report made
-            ending, by_person = ending_of(error), isinstance(error, NotInCommand)
+            ending, excuse = ending_of(error), excuse_of(error, robot_of(self.env), self.times)
         except BaseException:
             if not self._closing:
                 self._halt()
             raise
         ending = _unless_it_fails(ending, "closing", self._close)
-        if self.trials is not None:
-            # Of an episode that was cut short: one that a person ended says nothing of the policy.
-            ended = partial(self.trials.end, False, ending.reason, void=by_person)
+        if self.trials is not None and self.trials.is_running:  # of an episode that was cut short
+            self.uncounted = excuse
+            ended = partial(self.trials.end, False, excuse or ending.reason, void=by_person or excuse != "")
             ending = _unless_it_fails(ending, "recording the trial", ended)
         return _unless_it_fails(ending, "recording", self._flush)  # of an episode that was cut short
 
@@ -256,6 +269,22 @@ def ending_of(error: Exception) -> Ending:
     if isinstance(error, SafetyStop):
         return Ending(f"safety stop: {text}", 3)
     return Ending(f"fault: {text}", 1)
+
+
+def excuse_of(error: Exception, robot: Any, times: TickTimes) -> str:
+    """Why an episode that `error` ended is no verdict on the policy, in one line; "" if that may be the policy's fault.
+
+    Args:
+        error: The exception.
+        robot: The robot, behind its guards.
+        times: Of the last ticks.
+    """
+    is_ours = getattr(robot, "stopped", None) is not None
+    if is_ours or isinstance(error, SafetyStop):  # else by a guard of the live agent there
+        return times.excuse(by_time=is_ours and robot.code in TIMING_GUARDS)
+    if isinstance(error, LinkLost):
+        return "the link to the robot was lost"
+    return "somebody else drives the robot" if isinstance(error, NotInCommand) else ""
 
 
 def _unless_it_fails(ending: Ending, what: str, end: Callable[[], None]) -> Ending:

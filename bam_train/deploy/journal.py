@@ -114,6 +114,10 @@ class Journal:
                 self.successes = None
         return record
 
+    def judged(self, record: EpisodeRecord, success: bool) -> None:
+        """Take that a person says whether an ended episode, whose environment does not, was a success."""
+        record.success, self.successes = success, (self.successes or 0) + success
+
 
 @dataclass(frozen=True)
 class Ending:
@@ -145,6 +149,10 @@ class DeployReport:
     """Counts of the guards of a live robot, by name; see `SafeRobot.report`."""
     trials: Trials | None = None
     """The trials of this deployment."""
+    uncounted: str = ""
+    """Why the last trial does not count; see `Deployment.uncounted`."""
+    agent_guards: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """The same of the live agent that drives the robot otherwise, without limits; see `TakeOver.guards`."""
     shadow: Shadow | None = None
     """The comparison with whoever drove the robot."""
     recorder: Recorder | None = None
@@ -174,12 +182,10 @@ class DeployReport:
             "identity": self.identity,
             "marks": list(journal.marks),
             "trials": None if self.trials is None else self.trials.evidence.to_json(),
+            "uncounted": self.uncounted,
             "shadow": None if self.shadow is None else self.shadow.agreement.to_json(),
-            # A disabled limit is infinite, which JSON cannot represent.
-            "guards": {
-                name: {**guard, "limit": None} if guard.get("limit") == math.inf else dict(guard)
-                for name, guard in self.guards.items()
-            },
+            "guards": finite_limits(self.guards),
+            "agent_guards": finite_limits(self.agent_guards),
             "per_episode": [record.to_json() for record in journal.records],
             **({} if journal.highest is None else {"unusual": {"highest": journal.highest, "alarms": journal.alarms}}),
             **({} if self.recorder is None else {"recording": str(self.recorder.path)}),
@@ -210,10 +216,17 @@ class DeployReport:
             f"{reason}: {episodes}, {counted(self.pacer.ticks, 'tick')}, {rate_text(self.pacer)}{journal.marked}",
             *([f"lateness {lateness_text(self.pacer)}"] if self.pacer.period is not None else []),
             *([guards_text(self.guards, self.pacer.ticks)] if self.guards else []),
+            *([f"live agent: {guards_text(self.agent_guards, self.pacer.ticks)}"] if self.agent_guards else []),
+            *([f"the last trial does not count: {self.uncounted}"] if self.uncounted else []),
             *([self.trials.evidence.text] if self.trials else []),
             *([self.shadow.agreement.text] if self.shadow else []),
             *([recorded_text(self.recorder)] if self.recorder is not None else []),
         ]
+
+
+def finite_limits(guards: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The counts of guards as JSON values: the limit of one that is off is infinite, which JSON cannot represent."""
+    return {name: {**row, "limit": None} if row.get("limit") == math.inf else dict(row) for name, row in guards.items()}
 
 
 def rate_text(pacer: Pacer) -> str:

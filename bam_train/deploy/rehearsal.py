@@ -15,10 +15,10 @@ from bam_envs.core.registry import entry_of
 from bam_envs.live.rehearsed_robot import rehearsed_robot, time_to_stop
 from bam_envs.robots.linked import LinkedRobot, LinkProfile
 from bam_train.checkpoint import Checkpoint
-from bam_train.deploy.journal import EpisodeRecord
+from bam_train.deploy.journal import EpisodeRecord, finite_limits
 from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import LateChunk, SettingsError
-from bam_train.evaluation import wilson_interval
+from bam_train.evaluation import success_text, wilson_interval
 from bam_train.files.log_lines import counted
 from bam_train.policy import FrozenPolicy
 from bam_train.policy.background import Background, ChunkRequest
@@ -47,7 +47,8 @@ class RehearsalReport:
 
     def to_json(self) -> dict[str, Any]:
         """The report as JSON values."""
-        episodes, successes = len(self.records), sum(bool(record.success) for record in self.records)
+        episodes, known = len(self.records), [record.success for record in self.records if record.success is not None]
+        successes = sum(known) if known else None
         rested = [seconds for seconds in self.halts if math.isfinite(seconds)]
         return {
             "checkpoint": str(self.checkpoint),
@@ -56,23 +57,18 @@ class RehearsalReport:
             "seed": self.seed,
             "episodes": episodes,
             "successes": successes,
-            "success_rate": successes / episodes,
-            "success_interval": list(wilson_interval(successes, episodes)),
+            "success_rate": None if successes is None else successes / episodes,
+            "success_interval": None if successes is None else list(wilson_interval(successes, episodes)),
             "stopped_by": {name: row["stopped"] for name, row in self.guards.items() if row["stopped"]},
             "time_to_stop_s": {"p50": float(np.median(rested)), "max": max(rested)} if rested else None,
             "halts_without_rest": len(self.halts) - len(rested),
-            "guards": {
-                name: dict(row) if math.isfinite(row["limit"]) else {**row, "limit": None}
-                for name, row in self.guards.items()
-            },
+            "guards": finite_limits(self.guards),
             "per_episode": [record.to_json() for record in self.records],
         }
 
     def lines(self) -> list[str]:
         """The report as text."""
         facts, times = self.to_json(), "no halt was tried"
-        counts = "{successes} of {episodes}".format(**facts)
-        low, high = facts["success_interval"]
         if facts["time_to_stop_s"] is not None:
             times = "p50 {p50:.2f} s, max {max:.2f} s from a halt to rest".format(**facts["time_to_stop_s"])
         if facts["halts_without_rest"]:
@@ -85,7 +81,7 @@ class RehearsalReport:
         ]
         return [
             f"{self.checkpoint} on {self.env} behind {self.link}, with the guards of a live robot",
-            f"  success   {facts['success_rate']:.1%} ({counts}; 95 % interval {low:.1%} to {high:.1%})",
+            f"  success   {success_text(facts['successes'], facts['episodes'])}",
             *(f"  {title:<8}  {self._by_guard(effect, of)}" for title, effect, of in rows),
             f"  stopping  {times}",
             f"  episodes  {facts['episodes']}, seeds {self.seed} to {self.seed + facts['episodes'] - 1}",

@@ -56,7 +56,7 @@ class Evidence:
     nameless: int = 0
     """Trials at the same address that do not count, because their record does not say that the robot was this one."""
     void: int = 0
-    """Trials that do not count, because a person, the computer or the link ended them."""
+    """Trials that do not count: a person, the computer or the link ended them, or nobody said how they went."""
 
     @property
     def value(self) -> float:
@@ -93,7 +93,8 @@ class Evidence:
         if self.repeated:
             done = f"{done} ({self.repeated} more repeated a seed, and a seed counts once)"
         if self.void:
-            done = f"{done} ({self.void} more do not count: a person, the computer or the link ended them)"
+            why = "cut short by a person, the computer or the link, or nobody judged them"
+            done = f"{done} ({self.void} more do not count: {why})"
         text = f"{done}; {self.missing} more without a failure would show {above}"
         if self.is_enough:
             text = f"{done}, which shows {above} (error probability at most {100 * ALPHA:g} %)"
@@ -326,6 +327,11 @@ class Trials:
     def evidence(self) -> Evidence:
         """The evidence of all trials so far, including earlier deployments; raises FormatError."""
         return self.record.evidence(self.subject, self.threshold)
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a trial has begun and not ended."""
+        return self._running is not None
 
     def next_seed(self, first: int) -> int:
         """The least seed from `first` on that no trial had so far, nor any after it; raises FormatError."""

@@ -74,6 +74,14 @@ def wilson_interval(successes: float, episodes: int) -> tuple[float, float]:
     return low, high
 
 
+def success_text(successes: int | None, episodes: int) -> str:
+    """The success rate, such as ``98.0% (98 of 100; 95 % interval 93.0% to 99.4%)``; None: it is not known."""
+    if successes is None:
+        return "unknown: the environment does not report is_success"
+    low, high = wilson_interval(successes, episodes)
+    return f"{successes / episodes:.1%} ({successes} of {episodes}; 95 % interval {low:.1%} to {high:.1%})"
+
+
 def summarise(env: str, episodes: Sequence[PlayedEpisode], seed: int, starts: int | None = None) -> EvaluationReport:
     """The report over `episodes` (at least one), of which the first has this seed."""
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError, SafetyStop
 from bam_envs.live.camera import LiveCamera
+from bam_envs.live.take_over import COUNTED
 from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.ros.codec import AGENT_STEP_TOPIC, AGENT_TOPIC, HALT_TOPIC, RobotInfo
 from bam_envs.rosbridge.bus import Caller
@@ -238,11 +239,17 @@ class FrontProcess:
         if do == "take":
             self.take_over(caller, who, who)
             self._episode += 1
-            return {"state": self._report["state"], "learner": self.listens(EVENT)}
+            return {**self._told(), "learner": self.listens(EVENT)}
         if do == "hand_back":
             self.hand_back(caller.client, who, caller.address)
-            return {"state": self._report["state"]}
+            return self._told()
         raise RemoteError(f"{AGENT_TOPIC}: expected look, take or hand_back, found {do!r:.40}.")
+
+    def _told(self) -> Fields:
+        """The agent's state, and the counts of its guards, without limits: JSON has no infinite ones."""
+        guards = self._report.get("guards", {})
+        counts = {name: {what: row[what] for what in ("number", *COUNTED)} for name, row in guards.items()}
+        return {"state": self._report["state"], "guards": counts}
 
     def take_over(self, caller: Caller, who: str, shown: str, *, force: bool = False) -> None:
         """Give `caller` the lease; other clients see the name `shown`."""

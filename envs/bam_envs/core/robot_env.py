@@ -67,6 +67,8 @@ class _RobotAndTask:
         self.metadata: dict[str, Any] = {"render_modes": render_modes(), "render_fps": round(1 / robot.spec.period)}
         self.state: RobotState | None = None
         """The last state, or None when no episode runs."""
+        self.says_success: bool = getattr(task, "says_success", True)
+        """Whether infos have ``is_success``; a task may not know what success is."""
 
     @property
     def period(self) -> float:
@@ -162,7 +164,7 @@ class RobotEnv(_RobotAndTask, gym.Env[Any, Any]):
         if self.render_mode == "human":
             self.render()
         self._observed = indexed(self.task.observe(self.state), 0)
-        return self._observed, {"is_success": False}
+        return self._observed, self._outcome(success=False)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Send the command of `action` (a,), or a whole number; observe and score one period later."""
@@ -179,7 +181,12 @@ class RobotEnv(_RobotAndTask, gym.Env[Any, Any]):
             self._observed = observation
         if self.render_mode == "human":
             self.render()
-        return observation, float(score.reward[0]), terminated, False, first_info(score)
+        info = self._outcome(success=bool(score.success[0])) | first_info(score)
+        return observation, float(score.reward[0]), terminated, False, info
+
+    def _outcome(self, *, success: bool) -> dict[str, Any]:
+        """The success as an info, if the task knows what that is."""
+        return {"is_success": success} if self.says_success else {}
 
     def state_dict(self) -> dict[str, Any]:
         """The complete state of a simulated robot, its task and its generator; plain arrays and values."""
@@ -251,6 +258,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[Any, Any, NDArray[Any]]
         """Steps since each episode began. Shape: (n,)."""
         self._rngs = [np.random.default_rng() for _ in range(self.num_envs)]
         self._all = np.ones(self.num_envs, dtype=bool)
+        self._says = np.full(self.num_envs, self.says_success)  # the mask of ``is_success``
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -269,7 +277,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[Any, Any, NDArray[Any]]
             if one is not None and mask[i]:
                 self._rngs[i] = seeding.np_random(one)[0]
         observation = self._reset(np.flatnonzero(mask), task_options)
-        return observation, {"is_success": np.zeros(self.num_envs, dtype=bool), "_is_success": self._all.copy()}
+        return observation, {"is_success": np.zeros(self.num_envs, dtype=bool), "_is_success": self._says.copy()}
 
     def _seeds(self, seed: int | list[int | None] | None) -> Sequence[int | None]:
         if seed is None:
@@ -296,7 +304,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[Any, Any, NDArray[Any]]
         self.elapsed += 1
         limit = self.max_episode_steps
         truncated = np.zeros(self.num_envs, dtype=bool) if limit is None else self.elapsed >= limit
-        infos = {"is_success": score.success, "_is_success": self._all.copy()}
+        infos = {"is_success": score.success, "_is_success": self._says.copy()}
         for key, value in score.info.items():
             infos[key], infos["_" + key] = value, present(value)
         ended = score.terminated | truncated
@@ -315,7 +323,7 @@ class RobotVectorEnv(_RobotAndTask, gym.vector.VectorEnv[Any, Any, NDArray[Any]]
         values = {key: value for key, value in infos.items() if not key.startswith("_")}
         masks = {"_" + key: infos["_" + key] for key in values}
         infos |= {name: mask & ~ended for name, mask in masks.items()}  # `reset` gives no such info
-        infos |= {"is_success": values["is_success"] & ~ended, "_is_success": self._all.copy()}
+        infos |= {"is_success": values["is_success"] & ~ended, "_is_success": self._says.copy()}
         infos["final_info"] = {**values, **{name: mask & ended for name, mask in masks.items()}}
         infos["final_obs"], infos["_final_obs"], infos["_final_info"] = observation, ended, ended
         return self._reset(np.flatnonzero(ended), {})

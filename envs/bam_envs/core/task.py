@@ -44,7 +44,7 @@ class Score:
 
 
 def unscored(num_envs: int) -> Score:
-    """The outcome of a step that nothing rewards and that ends nothing."""
+    """The outcome of a step that nothing rewards and that ends nothing, for a task with ``says_success`` False."""
     return Score(np.zeros(num_envs), np.zeros(num_envs, dtype=bool), np.zeros(num_envs, dtype=bool))
 
 
@@ -62,6 +62,9 @@ class Task(Protocol):
 
     A task with a fixed number of different starts has it as ``num_starts``, and as ``drawn`` the number of the start of
     each environment, from 0 on. Shape: (n,).
+
+    A task that does not know what success is has ``says_success``, False: no info of its environment has
+    ``is_success``, and the `success` of its scores stays False.
     """
 
     num_envs: int
@@ -148,9 +151,8 @@ def as_objects(values: Sequence[Any]) -> NDArray[Any]:
 
 
 def first_info(score: Score) -> dict[str, Any]:
-    """The info of the first environment in plain Python values, without empty texts."""
-    info = {key: _plain(value[0]) for key, value in score.info.items() if present(value)[0]}
-    return {"is_success": bool(score.success[0]), **info}
+    """The info of the first environment in plain Python values, without empty texts and without its success."""
+    return {key: _plain(value[0]) for key, value in score.info.items() if present(value)[0]}
 
 
 def present(value: NDArray[Any]) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ import itertools
 import math
 import re
 from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
@@ -166,6 +167,11 @@ def described_checks(spec: RobotSpec, chain: SerialChain, margin: float, inspect
     tool centre point, with the axis along which it points; and the axis along which the gripper closes is compared with
     the first joints that move behind the last one of the arm.
     """
+    for line in _described(spec, chain, margin, inspection):
+        yield replace(line, remedy=f"correct the robot or the description of {spec.name}")
+
+
+def _described(spec: RobotSpec, chain: SerialChain, margin: float, inspection: Inspection) -> Iterator[Check]:
     urdf, why = _description(inspection)
     names = [name for name, unit in zip(spec.command.labels, spec.command.units, strict=True) if unit == "rad"]
     state = inspection.profile.state

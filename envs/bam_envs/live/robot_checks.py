@@ -7,6 +7,7 @@ have no further lines.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,6 +48,8 @@ class Check:
     """None if the robot's messages do not decide the line, which then does not refuse the robot."""
     passes: bool = False
     """Whether a busy computer or network changes the line, so that another look may find another value."""
+    remedy: str = ""
+    """What to do where the line does not fit; empty: correct the robot or its profile."""
 
     @property
     def verdict(self) -> str:
@@ -108,13 +111,14 @@ def _timing(spec: RobotSpec, inspection: Inspection, reading: Reading) -> Iterat
     allowed = source.max_age or inspection.profile.max_age
     least = 1 / allowed if source.max_age else max(1 / allowed, STATES_PER_COMMAND / spec.period)
     busy = inspection.busy and f"; {inspection.busy}"
+    late: Any = {"passes": True, "remedy": busy and "end other programs on this computer, and run it again"}
     what = f"{rate:.3g} Hz" if rate else f"{reading.new} new in {inspection.seconds:.1f} s"
     what += "" if (fits := rate >= least) else busy
-    yield Check(f"rate of {source.topic}", f"at least {least:.3g} Hz", what, fits=fits, passes=True)
+    yield Check(f"rate of {source.topic}", f"at least {least:.3g} Hz", what, fits=fits, **late)
     if fits:
         age = max(0.0, float(np.median(reading.delays)))
         found = f"{age:.3f} s{'' if (fits := age <= allowed) else busy}"
-        yield Check(f"age of {source.topic}", f"at most {allowed:g} s", found, fits=fits, passes=True)
+        yield Check(f"age of {source.topic}", f"at most {allowed:g} s", found, fits=fits, **late)
     found = ""  # of stamps that do not tell when a message was measured, from which its age would be judged
     if has_header(source.type) and None in reading.stamps:
         found = "0: ages are judged by arrival alone, and a driver that repeats old states is not noticed"

@@ -139,6 +139,8 @@ class RosbridgeRobot:
         self._take_over: TakeOver | None = None  # of a robot that a live agent drives
         self.agent_state = ""
         """The state of that agent once the robot was handed back, such as ``"paused"``; "" if it is unknown."""
+        self.agent_guards: dict[str, dict[str, Any]] = {}
+        """What that agent's guards did to the commands of this robot; see `TakeOver.guards`."""
         self._session_over = False  # as the robot's side reported
         self._refusals: list[BamEnvsError] = []
         self._status = ""  # of this tick, as JSON
@@ -654,7 +656,7 @@ class RosbridgeRobot:
             self.halt()
         if self._take_over is not None:
             self.agent_state = self._take_over.hand_back()
-            self._take_over = None
+            self.agent_guards, self._take_over = self._take_over.guards, None
         self._session.leave()
         control, halting, goals = self._control, self._halting, self._goals
         self._control = self._halting = self._goals = None

@@ -289,6 +289,11 @@ class SafeRobot(metaclass=Sealed):
         """The state of a live agent once its robot was handed back, such as ``"paused"``; "" if it is unknown."""
         return getattr(self._live, "agent_state", "")
 
+    @property
+    def agent_guards(self) -> dict[str, dict[str, Any]]:
+        """As `report`, of that agent's guards, without limits and without guards that did nothing; see `TakeOver`."""
+        return getattr(self._live, "agent_guards", {})
+
     def not_ready(self) -> str | None:
         """Why a live robot reports that it cannot move now, or None. May call its services: only at rest."""
         why: str | None = getattr(self._live, "not_ready", lambda: None)()

@@ -29,7 +29,7 @@ class ObserveTask(Memory):
         0.
 
     Success:
-        Never.
+        Not known: infos have no ``is_success``.
 
     End:
         Never.
@@ -38,6 +38,7 @@ class ObserveTask(Memory):
         Nothing.
     """
 
+    says_success = False
     action_labels = (Label("nothing", "moves nothing", "1"),)
     observation_labels = (
         *(Label(joint, "joint position from the home pose", "rad", "- home", -4, 4) for joint in JOINTS),

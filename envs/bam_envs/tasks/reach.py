@@ -197,7 +197,7 @@ class JointsTask(ReachTask):
         0.
 
     Success:
-        Never.
+        Not known: infos have no ``is_success``.
 
     End:
         Never.
@@ -207,6 +207,7 @@ class JointsTask(ReachTask):
     """
 
     memory: Mapping[str, str] = {"sent": "_sent"}
+    says_success = False
 
     def __init__(self, num_envs: int = 1, *, robot_model: Any = DEFAULT_ARM, rate: float = 1 / PERIOD) -> None:
         super().__init__(num_envs, robot_model=robot_model)

@@ -105,10 +105,11 @@ PLACES = {"target_coord": (3,), "target_rot": (4,)}
 @pytest.mark.parametrize("wire", [False, True])
 def test_infos_are_plain_and_can_be_pickled(make, env_id, wire):
     env = make(env_id, rs_state_to_info=True) if wire and ENVIRONMENTS[env_id].variants else make(env_id)
+    outcome = {} if env_id == "bam/joints-v0" else {"is_success": False}  # it does not know what success is
     _, info = env.reset(seed=0)
-    assert info == {"is_success": False}
+    assert info == outcome
     *_, info = env.step(env.action_space.sample())
-    assert info["is_success"] is False
+    assert info.get("is_success") is outcome.get("is_success")
     assert type(info.get("distance", 0.0)) is float
     for name, shape in PLACES.items():
         place = info.get(name, np.zeros(shape))

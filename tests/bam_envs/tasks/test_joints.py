@@ -41,6 +41,14 @@ def test_the_tool_stays_above_the_lower_end_of_the_work_area(env):
     assert tool[0, 2] >= env.task.space.box[0, 2] - 1e-6
 
 
+def test_whether_an_episode_succeeded_is_not_known(make_rows):
+    rows = make_rows("bam/joints-v0", 2, robot_model="so101", max_episode_steps=2)
+    infos = [rows.reset(seed=0)[1]]
+    infos += [rows.step(np.zeros((2, 6), np.float32))[-1] for _ in range(3)]
+    infos.append(infos[2]["final_info"])
+    assert [info["_is_success"].tolist() for info in infos] == [[False, False]] * 5
+
+
 @pytest.mark.parametrize(("rate", "found"), [(4, "4"), (1000.0, "1000.0"), ("30", "'30'")])
 def test_a_rate_that_no_arm_takes_is_refused(rate, found):
     with pytest.raises(InvalidValue, match=re.escape(f"found {found}") + "$|must be a number, not '30'"):

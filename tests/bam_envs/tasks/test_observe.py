@@ -17,7 +17,7 @@ def test_nothing_moves_and_nothing_ends(make):
     assert env.observation_space.contains(first)
     for step in range(100):
         observation, reward, terminated, truncated, info = env.step(np.float32([1 - 2 * (step % 2)]))
-        assert (reward, terminated, truncated, info) == (0.0, False, step == 99, {"is_success": False})
+        assert (reward, terminated, truncated, info) == (0.0, False, step == 99, {})
     np.testing.assert_allclose(observation["robot"], first["robot"], atol=0.01)
     for camera in ("front", "wrist"):
         assert np.abs(observation[camera].astype(int) - first[camera]).mean() < 2

@@ -170,6 +170,8 @@ def test_a_program_takes_over_and_hands_back(running):
         observation, *_ = env.step(policy.act(observation))
     env.close()
     status = running.state("paused")
+    for name, row in env.unwrapped.robot.agent_guards.items():  # since it took over, and not of the agent's policy
+        assert all(0 <= row[what] <= status["guards"][name][what] for what in ("altered", "held", "stopped"))
     assert (status["owner"], status["why"].split(" by ")[0]) == (None, "handed back")
     running.run()
     assert running.state()["stage"] == "full"

@@ -32,6 +32,7 @@ class Agent:
         env = versions.first(given).env
         interface = interface_of(make_env(env))
         self.session = SimpleNamespace(env_id=env, env_kwargs={}, interface=interface, is_real=False, identity="")
+        self.session.says_success = True
         self.succession, self.sent, self.notes = Succession(self, versions), [], []
         self.answered, self.state, self.why, self.since = threading.Event(), State.TRIAL, "", 0.0
         self.on_progress = lambda text: None
@@ -107,6 +108,16 @@ def test_a_pushed_candidate_acts_and_is_promoted_by_its_trials(agent, better):
     assert agent.succession.names == {"champion": new, "given": old, "previous": old}
     text = "33 of 33 trials succeeded, which shows more than 90 % (error probability at most 5 %)"
     assert agent.notes[-1] == ("promoted", f"{new[:12]} is the champion: {text}")
+
+
+def test_nobody_waits_for_trials_that_decide_nothing(agent, better):
+    agent.session.says_success = False
+    active = agent.succession.active
+    assert agent.ask("push", path=str(better), wait=True).error == (
+        "bam/pick-v0 reports no success, so that no trial here decides: do the trials with bam-deploy --stage trial, "
+        "then push with --stage full"
+    )
+    assert agent.succession.active is active
 
 
 SLOW = {"success": True, "length": 300, "end": "terminated", "slow": 57}

@@ -54,8 +54,10 @@ def test_report_for_programs(corridor_checkpoint, starting_cell, run):
         "identity": "",
         "marks": [],
         "trials": None,
+        "uncounted": "",
         "shadow": None,
         "guards": {},
+        "agent_guards": {},
         "per_episode": [
             {"seed": seed, "length": length, "return": 1 - 0.25 * length, "success": True, "end": "terminated"}
             for seed, length in zip((7, 8, 9), lengths, strict=True)

@@ -1,4 +1,5 @@
 import io
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -7,7 +8,7 @@ from rich.console import Console
 
 from bam_envs.core.timing import Pacer
 from bam_train.cli.deploy_display import LiveDeployment, PlainDeployment, live_display, numbers_of
-from bam_train.deploy.journal import Journal
+from bam_train.deploy.journal import EpisodeRecord, Journal
 
 
 class Panel:
@@ -45,6 +46,22 @@ def test_plain_display_writes_a_line_an_episode(success, end, length, line):
     record.total, record.length, record.success, record.end = 12.3123, length, success, end
     display.ended(record)
     assert lines == [f"episode 1/5 (seed 8): {line}"]
+
+
+@pytest.mark.parametrize(
+    ("typed", "answer", "asked"),
+    [("yes\n", True, 1), ("y\n NO \n", False, 2), ("\n\n\nyes\n", None, 3), ("", None, 3)],
+)
+@pytest.mark.parametrize("panel", [False, True])
+def test_who_stands_beside_the_robot_is_asked(corridor, monkeypatch, typed, answer, asked, panel):
+    monkeypatch.setattr("sys.stdin", io.StringIO(typed))
+    lines, screen = [], io.StringIO()
+    display = PlainDeployment(Journal(1), lines.append)
+    if panel:
+        display = LiveDeployment(SimpleNamespace(console=Console(file=screen)), gym.make(corridor), "t", Journal(1))
+    assert display.judge(EpisodeRecord(8)) is answer
+    question = "Did it do its task in the episode with seed 8? Type yes or no:"
+    assert (screen.getvalue().count(question), lines) == ((asked, []) if panel else (0, [question] * asked))
 
 
 def test_a_warning_is_written_once():

@@ -75,7 +75,8 @@ def test_a_refused_contract(run, served, forge, tmp_path):
     assert status == 3
     assert err == (
         f"bam-doctor: contract failed: {path} and the robot do not fit: period [s]: expected 0.1, found 0.05; "
-        "correct the robot or its profile; nothing has moved\n"
+        "train the policy anew, or use the version, and the arm (--robot-model), that it was trained with; nothing has "
+        "moved\n"
     )
     assert any(line.split() == ["period", "[s]", "0.1", "0.05", "refused"] for line in out.splitlines())
 

@@ -261,7 +261,8 @@ def test_a_robot_that_does_not_fit_is_refused_by_its_line_and_gets_no_command(se
     assert rest == f"{rows.count('ok')} lines fit; bam-deploy --print-contract shows them"
     assert last == (
         f"bam-deploy: {PICK} and the robot at {served.bus.url} do not fit: topic /object_pose: expected "
-        "geometry_msgs/PoseStamped, found nobody publishes it; correct the robot or its profile; nothing has moved"
+        "geometry_msgs/PoseStamped, found nobody publishes it; start the robot with bam-serve --env bam/pick; nothing "
+        "has moved"
     )
 
 

@@ -11,21 +11,25 @@ from types import SimpleNamespace
 import gymnasium as gym
 import pytest
 
-from bam_envs.core.errors import InvalidValue, LinkLost, NotInCommand
+from bam_envs.core.errors import InvalidValue, LinkLost, NotInCommand, SafetyStop
 from bam_envs.core.location import HERE, LiveRobot
-from bam_envs.live import bringup
+from bam_envs.core.timing import Pacer
+from bam_envs.live import bringup, examination
 from bam_envs.live.bringup import robot_info
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.safety.guard import BOUNDS, Limits
 from bam_train.checkpoint import Checkpoint
 from bam_train.cli.deploy import main as deploy
+from bam_train.deploy import episode
 from bam_train.deploy.checkpoint_admission import Admission
+from bam_train.deploy.deployment import Deployment
+from bam_train.deploy.journal import DeployReport, Journal
 from bam_train.deploy.trials import Subject, TrialRecord, Trials
 from bam_train.environments import with_live_robot
 from bam_train.errors import FormatError, SettingsError
 from bam_train.recording.recording import Recording
-from tests.bam_train.deploy.test_deployment import Driven, raises
+from tests.bam_train.deploy.test_deployment import Driven, Right, Silent, raises
 from tests.bam_train.deploy.test_deployment import run as run_deployment
 
 REACH = Path(__file__).parents[3] / "checkpoints" / "reach-ppo.zip"
@@ -184,12 +188,60 @@ def test_every_episode_is_a_trial(corridor, trials):
     assert reasons(trials) == ["terminated"] * 3
 
 
-def test_an_episode_that_is_cut_short_has_failed(corridor, trials):
-    env = Driven(gym.make(corridor, disable_env_checker=True), raises(LinkLost("the link dropped")), at=2)
-    ending, _, _ = run_deployment(env, trials=trials)
-    assert ending.status == 4
-    assert (trials.evidence.successes, trials.evidence.trials) == (trials.evidence.trials - 1, trials.evidence.trials)
-    assert reasons(trials)[-1] == "link lost: the link dropped"
+STOP = SafetyStop(
+    "following", "The robot was stopped by following (G23): wrist_1 lags. When it is safe, call resume()."
+)
+BUSY = "20 of the last 20 ticks were disturbed, and an action needs 0 ms of the CPU, and the period is 50 ms"
+
+
+@pytest.mark.parametrize(
+    ("error", "guard", "late", "excuse"),
+    [
+        (LinkLost("the link dropped"), 0, 0.0, "the link to the robot was lost"),
+        (STOP, 23, 0.0, ""),
+        (STOP, 23, 0.01, f"{BUSY}: the computer is busy"),
+        (STOP, 15, 0.0, f"{BUSY.partition('and ')[2]}: the computer or the link was late"),
+        (ValueError("no torch"), 0, 0.01, ""),
+    ],
+    ids=["link", "policy", "busy", "late", "fault"],
+)
+def test_an_episode_that_is_cut_short_has_failed_unless_a_link_or_a_busy_computer_did_it(
+    corridor, trials, monkeypatch, error, guard, late, excuse
+):
+    """By the rule of the live agent."""
+    clock = SimpleNamespace(time=0.0)
+    env = Driven(gym.make(corridor, slow=True, max_episode_steps=-1), raises(error), at=25)
+    env.robot.code, env.robot.stopped = guard, "following (G23)" if isinstance(error, SafetyStop) else None
+
+    def sleep(seconds):
+        clock.time += seconds + late
+
+    pacer, journal = Pacer(0.05, now=lambda: clock.time, sleep=sleep), Journal(3)
+    monkeypatch.setattr(episode, "thread_time", lambda: 0.0)
+    deployment = Deployment(env, Right(), pacer, journal, trials=trials)
+    ending = deployment.run(Silent(), seed=7)
+    assert deployment.uncounted == excuse
+    assert reasons(trials)[-1] == (excuse or ending.reason)
+    assert (trials.evidence.trials, trials.evidence.void) == ((0, 1) if excuse else (1, 0))
+    lines = DeployReport(None, 7, ending, journal, pacer, trials=trials, uncounted=deployment.uncounted).lines()
+    assert (f"the last trial does not count: {excuse}" in lines) is (excuse != "")
+
+
+def test_who_is_asked_says_whether_an_episode_succeeded_if_the_environment_does_not(corridor, trials):
+    env = Driven(gym.make(corridor, says_success=False, disable_env_checker=True))
+    nobody = Deployment(env, Right(), Pacer(None), Journal(2), trials=trials)
+    nobody.run(Silent(), seed=trials.next_seed(7))
+    assert (trials.evidence.trials, trials.evidence.void) == (0, 2)
+    assert reasons(trials) == ["nobody said whether it succeeded"] * 2 == [nobody.uncounted] * 2
+    answers = iter([True, False, True])
+    env = Driven(gym.make(corridor, says_success=False, disable_env_checker=True))
+    journal = Journal(3)
+    asked = Deployment(env, Right(), Pacer(None), journal, trials=trials)
+    asked.judge = lambda record: next(answers)
+    asked.run(Silent(), seed=trials.next_seed(7))
+    assert (trials.evidence.successes, trials.evidence.trials, trials.evidence.void) == (2, 3, 2)
+    assert ([record.success for record in journal.records], journal.successes) == ([True, False, True], 2)
+    assert asked.uncounted == ""
 
 
 def press_ctrl_c():
@@ -201,7 +253,8 @@ def test_an_episode_that_a_person_ends_is_no_trial(corridor, trials, happens):
     run_deployment(Driven(gym.make(corridor, slow=True), happens, at=12), trials=trials)
     assert (trials.evidence.trials, trials.evidence.void) == (1, 1)
     assert trials.evidence.text == (
-        "0 of 1 trial succeeded (1 more do not count: a person, the computer or the link ended them); 57 more without "
+        "0 of 1 trial succeeded (1 more do not count: cut short by a person, the computer or the link, or nobody "
+        "judged them); 57 more without "
         "a failure would show more than 90 %"
     )
     assert trials.next_seed(7) == 9  # and its seed does not come again
@@ -241,7 +294,8 @@ def test_flags_that_do_not_fit(run, flags, text):
 def served(monkeypatch, tmp_path):
     """Serves an arm of that name that seems to be real."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(bringup, "robot_info", lambda link: replace(robot_info(link), simulated=False))
+    for module in (bringup, examination):
+        monkeypatch.setattr(module, "robot_info", lambda link: replace(robot_info(link), simulated=False))
     with ExitStack() as stack:
 
         def serve(name=""):
@@ -255,11 +309,12 @@ def served(monkeypatch, tmp_path):
 def test_a_real_robot_is_on_trial_unless_something_else_is_asked_for(served, run):
     url = served()
     flags = ("--robot", url, "--allow-unsigned", "--no-record")
-    assert run(deploy, REACH, *flags) == (
+    status, out, err = run(deploy, REACH, *flags)
+    assert (status, out, err.splitlines()[-1]) == (
         1,
         "",
         f"bam-deploy: the robot at {url} does not tell which one it is, and every tunnel ends at such an address, so "
-        "that its trials could count for another robot: name it with --robot-name NAME, always the same\n",
+        "that its trials could count for another robot: name it with --robot-name NAME, always the same",
     )
     flags = (*flags, "--robot-name", "left arm")
     status, _, err = run(deploy, REACH, *flags)

@@ -88,6 +88,14 @@ def test_a_limit_that_is_off_is_null(corridor_checkpoint):
     assert values["guards"] == {"state age": {**guards["state age"], "limit": None}}
 
 
+def test_a_live_agents_guards_are_reported_as_ours(corridor_checkpoint):
+    agents = {"joint speed": {"number": "G8", "altered": 2, "held": 0, "stopped": 0}}
+    report = DeployReport(Checkpoint.open(corridor_checkpoint()), 0, Ending("x", 0), journal(), driven_pacer(0.05))
+    report = replace(report, agent_guards=agents)
+    assert report.lines()[-1] == ("live agent: guards changed the command: joint speed (G8) in 2 of 4 ticks (50.0 %)")
+    assert report.to_json()["agent_guards"] == agents
+
+
 def test_lines(corridor_checkpoint):
     checkpoint = Checkpoint.open(corridor_checkpoint())
     first, second = DeployReport(checkpoint, 0, Ending("episodes done", 0), journal(), driven_pacer(0.05)).lines()
