@@ -30,9 +30,11 @@ from tests.checks.libraries import spread
 
 PAGE = ROOT / "docs" / "presets.md"
 ZOO = {
+    "Acrobot-v1-ppo": -73.5,
     "CartPole-v1-a2c": 500.0,
     "CartPole-v1-dqn": 500.0,
     "CartPole-v1-ppo": 500.0,
+    "LunarLander-v3-ppo": 242.1,  # of LunarLander-v2
     "MountainCarContinuous-v0-ppo": 88.3,
     "Pendulum-v1-ppo": -172.2,
     "Pendulum-v1-sac": -157.0,
