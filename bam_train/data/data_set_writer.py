@@ -12,7 +12,19 @@ import numpy as np
 from bam_envs.core.wording import brief
 from bam_train.data.data_set import DataSet
 from bam_train.data.file_pair import Columns, Head, kind_of
-from bam_train.data.layout import BAM, COPIES, DATA, DEFAULTS, EPISODES, INFO, Files, WriterLock, file_name
+from bam_train.data.layout import (
+    BAM,
+    COPIES,
+    DATA,
+    DEFAULTS,
+    EPISODES,
+    INFO,
+    STATE,
+    STATE_ALONE,
+    Files,
+    WriterLock,
+    file_name,
+)
 from bam_train.data.mending import mend
 from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, digest_of
 from bam_train.environments import first_difference
@@ -137,7 +149,8 @@ class DataSetWriter:
     def _extra_column(self, name: str, values: Any, steps: int) -> Array:
         array = np.asarray(values)
         found = kind_of(array)
-        if "/" in name or name in DEFAULTS or name.startswith(("observation.", "action", "next.", "bam")):
+        taken = name.startswith(("observation.", "action", "next.", "bam")) and name not in (STATE, STATE_ALONE)
+        if "/" in name or name in DEFAULTS or taken or name in {one.column for one in self._observation}:
             raise BadDataSet(f"{self._files.text}: a column cannot be called {name!r}; choose another name")
         if array.shape[:1] != (steps,):
             raise BadDataSet(f"{self._files.text}: column {name}: expected {steps} steps, found shape {array.shape}")

@@ -68,7 +68,7 @@ def read(root, tmp_path):
     return lerobot_python(tmp_path, READER, root, "0.05", tmp_path / "cache")
 
 
-POLICIES = ("act-null", "act-0.1", "diffusion-null", "act-null-served")
+POLICIES = ("act-null", "act-0.1", "diffusion-null", "act-null-served", "flow-null-served")
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +82,37 @@ def exported(tmp_path_factory):
 @pytest.mark.parametrize("name", POLICIES)
 def test_an_exported_policy_acts_as_in_lerobot(exported, name):
     assert exported[1][name] <= 1e-5
+
+
+TWO_CAMERAS = ("--set", 'camera=["front","wrist"]', "--set", "image_size=32")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seen", [TWO_CAMERAS, ()], ids=["two cameras", "states only"])
+def test_what_lerobot_trains_on_our_data_is_exported_and_acts_as_there(tmp_path, seen):
+    """On 100 recorded frames; then it drives the arm in simulation."""
+    data = ["-m", "bam_train.cli.data.bam_data"]
+    options = ["--env", "bam/pick", "--policy", "scripted", "--episodes", "3", *seen]
+    lerobot_program(tmp_path, *data, "collect", "recorded", *options)
+    lerobot_program(tmp_path, *data, "export", "recorded", "--to", "lerobot", "--out", "data")
+    small = [
+        "chunk_size=8",
+        "n_action_steps=4",
+        "dim_model=32",
+        "n_heads=2",
+        "dim_feedforward=32",
+        "n_encoder_layers=1",
+    ]
+    small += ["type=act", "pretrained_backbone_weights=null", "device=cpu", "push_to_hub=false"]
+    flags = ["--dataset.repo_id=bam/data", "--dataset.root=data", "--output_dir=out", "--num_workers=0", "--steps=30"]
+    flags += [f"--policy.{one}" for one in small]
+    lerobot_program(tmp_path, HERE / "lerobot_beside_torch.py", "lerobot.scripts.lerobot_train", *flags)
+    folder = tmp_path / "out" / "checkpoints" / "last" / "pretrained_model"
+    found = lerobot_python(tmp_path, HERE / "lerobot_trained.py", "data", folder, "act.zip")
+    assert found["worst"] <= 1e-5
+    assert found["largest"] > 0.1
+    deploy = ["-m", "bam_train.cli.deploy", "act.zip", "--episodes", "1", "--fast", "--json"]
+    assert lerobot_python(tmp_path, *deploy)["stop_reason"] == "episodes done"
 
 
 @pytest.mark.slow
