@@ -7,7 +7,8 @@ where the policy runs. Any policy with chunks is served: LeRobot computes them o
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from importlib import import_module
 from importlib.metadata import version
@@ -143,9 +144,23 @@ def _kind(folder: Path, config: Mapping[str, Any], served: bool) -> str:
     return kind
 
 
+@contextmanager
+def _reading(folder: Path, kind: str) -> Iterator[None]:
+    """What LeRobot raises of a folder, as errors of ours."""
+    try:
+        yield
+    except ImportError as error:
+        text = f"{folder}: LeRobot makes the network, and {error.name or 'lerobot'} is not installed"
+        raise SettingsError(f'{text}. Run: pip install "lerobot{"" if kind in KINDS else f"[{kind}]"}"') from error
+    except Exception as error:  # of any kind: its configuration, weights and processors have readers of their own
+        text = f"LeRobot {version('lerobot')} cannot load it: {' '.join(str(error).split()):.160}"
+        remedy = "Copy the folder whole, or export it with the version of LeRobot that trained it"
+        raise CheckpointMismatch(folder, f"{text.rstrip('.')}. {remedy}") from error
+
+
 def _loaded(folder: Path, kind: str) -> Any:
     """The policy, as LeRobot makes it."""
-    try:
+    with _reading(folder, kind):
         if kind in KINDS:
             made = getattr(import_module(f"lerobot.policies.{kind}.modeling_{kind}"), KINDS[kind])
         else:
@@ -154,9 +169,6 @@ def _loaded(folder: Path, kind: str) -> Any:
         if kind in KINDS:
             config.pretrained_backbone_weights = None  # else they are downloaded, and then replaced by its own
         return made.from_pretrained(folder, config=config)
-    except ImportError as error:
-        text = f"{folder}: LeRobot makes the network, and {error.name or 'lerobot'} is not installed"
-        raise SettingsError(f'{text}. Run: pip install "lerobot{"" if kind in KINDS else f"[{kind}]"}"') from error
 
 
 def _features(config: Any) -> dict[str, tuple[int, ...]]:
@@ -178,7 +190,8 @@ class _Library:
         config, self.version = self._policy.config, version("lerobot")
         own = {"device_processor": {"device": str(config.device)}}
         make = import_module("lerobot.policies.factory").make_pre_post_processors
-        self._before, self._after = make(config, pretrained_path=str(folder), preprocessor_overrides=own)
+        with _reading(folder, kind):
+            self._before, self._after = make(config, pretrained_path=str(folder), preprocessor_overrides=own)
         self.features, self.shape = _features(config), tuple(config.action_feature.shape)
         ensemble = getattr(config, "temporal_ensemble_coeff", None)
         self.chunk = _chunk(folder, Chunk(config.chunk_size, config.n_action_steps, 1, ensemble), asked)
@@ -298,7 +311,7 @@ def _norms(folder: Path, steps: list[dict[str, Any]]) -> Any:
     def norm(feature: str, shape: tuple[int, ...]) -> Norm:
         mean, std, ends = np.zeros(shape[0]), np.ones(shape[0]), (np.zeros(0), np.zeros(0))
         for step in found:
-            config, file = step["config"], str(step.get("state_file"))
+            config, file = step["config"], step.get("state_file", "its processor")
             arrays = _statistics(folder, file) if "state_file" in step else {}
             stats = {key.rpartition(".")[2]: value for key, value in arrays.items() if key.startswith(f"{feature}.")}
             numbers = {key: np.ravel(value).astype(np.float64) for key, value in stats.items()}

@@ -18,8 +18,8 @@ ONE_BY_ONE = "it gives one action at a time, and has no chunks to plan"
 FADE = 8
 """Least number of steps in which one chunk takes over from another, 0.4 s at 20 Hz."""
 LEFT, KNOWN = "chunk.left", "chunk.known"
-"""Inputs of a policy with an `overlap`: what is left of the chunk before for the next steps, filled up with zeros, (size,
-...); and for how many steps, and how many of these pass until a new one comes, (2,)."""
+"""Inputs of a policy with an `overlap`: what is left of the chunk before for the next steps, filled up with zeros,
+(size, ...); and for how many steps, and how many of these pass until a new one comes, (2,)."""
 STEEPEST = 1.5
 """Greatest slope of 3 w^2 - 2 w^3, by which a change-over fades."""
 

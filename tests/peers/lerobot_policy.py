@@ -1,7 +1,8 @@
 """Make small policies of LeRobot, export them, and print how far their actions are from LeRobot's `select_action`.
 
 The arguments are a folder and the policies' names: a kind, ``act``, ``diffusion`` or ``flow``, a hyphen, and the
-coefficient of the ensemble in JSON. Each has a folder of its name. With ``-served`` LeRobot computes on a policy server.
+coefficient of the ensemble in JSON. Each has a folder of its name. With ``-served`` LeRobot computes on a policy
+server.
 """
 
 import contextlib

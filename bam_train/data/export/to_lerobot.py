@@ -1,7 +1,7 @@
 """LeRobot v3.0: a copy in files of about 100 MB, as LeRobot has them, with the columns that all episodes have.
 
-LeRobot's networks look for ``observation.state`` beside images, and for ``observation.environment_state`` without any: a
-single vector is there by that name too.
+LeRobot's networks look for ``observation.state`` beside images, and for ``observation.environment_state`` without any:
+a single vector is there by that name too.
 """
 
 from __future__ import annotations
