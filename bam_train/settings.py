@@ -227,7 +227,7 @@ def _require_finite(name: str, value: Any) -> None:
 _WORDS = {"true": True, "True": True, "false": False, "False": False, "null": None, "None": None, "none": None}
 
 
-def parse_assignment(text: str, example: str) -> tuple[list[str], Any]:
+def parse_assignment(text: str, example: str, flag: str = "--set") -> tuple[list[str], Any]:
     """Split ``name.of.it=value`` into the parts of its name and its typed value.
 
     A value is JSON, Python's True, False or None, or else the text itself: ``64`` is an int, ``3e-4`` a float,
@@ -236,7 +236,7 @@ def parse_assignment(text: str, example: str) -> tuple[list[str], Any]:
     name, equals, typed = (part.strip() for part in text.partition("="))
     path = name.split(".")
     if not equals or not all(path):
-        raise SettingsError(f"--set {text}: expected name=value, such as --set {example}, found {text!r}")
+        raise SettingsError(f"{flag} {text}: expected name=value, such as {flag} {example}, found {text!r}")
     try:
         return path, _WORDS[typed] if typed in _WORDS else json.loads(typed)
     except ValueError:

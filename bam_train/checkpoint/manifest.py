@@ -45,6 +45,9 @@ class Chunk:
     ensemble: float | None = None
     """The actions of all chunks for a step are averaged, the i-th oldest with the weight exp(-ensemble i), and a chunk
     is due in every step (temporal ensembling: Zhao et al. 2023); None: the newest chunk counts."""
+    overlap: Annotated[int, Meta(ge=1, le=1000)] | None = None
+    """Steps in which a chunk continues what is left of the one before, by a policy that makes it so (real-time
+    chunking: Black et al. 2025; LeRobot's execution_horizon); None: it is made without that."""
     when_lost: Literal["finish", "halt"] = "finish"
     """If the server that computes the chunks is lost: the actions that wait are executed, and the robot halts if no
     chunk comes until then; or it halts at once."""

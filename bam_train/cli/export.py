@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bam_train.cli.console import say, tell
 from bam_train.cli.program import run_program
@@ -25,7 +25,7 @@ def export_policy(config: ExportConfig) -> None:
     from bam_train.trainers.best_checkpoint import FOLDER, require_output
 
     kind, path = _kind(config.source)
-    meant = {"rllib": ("policy",), "lerobot": ("data", "units", "served", "task"), "sb3": ("statistics",)}
+    meant = {"rllib": ("policy",), "lerobot": ("data", "units", "served", "task", "chunk"), "sb3": ("statistics",)}
     for other, names in meant.items():
         for name in names:
             if kind != other and getattr(config, name):
@@ -55,12 +55,14 @@ def _network(config: ExportConfig, kind: str, path: Path) -> Exported:
     """A policy of LeRobot, or an ONNX file that is described."""
     from bam_envs.core.registry import resolve_id
     from bam_train.compat.foreign_export import export_foreign
-    from bam_train.settings import read_env_kwargs
+    from bam_train.settings import parse_assignment, read_env_kwargs
 
     if kind == "lerobot":
         from bam_train.compat.lerobot_folder import lerobot_policy
 
-        policy = lerobot_policy(path, data=config.data, units=config.units, served=config.served, task=config.task)
+        asked = [parse_assignment(text, "steps=20", "--chunk") for text in config.chunk]
+        options: Any = {"chunk": {".".join(name): value for name, value in asked}, "task": config.task}
+        policy = lerobot_policy(path, data=config.data, units=config.units, served=config.served, **options)
     else:
         from bam_train.compat.foreign_policy import described_policy
 

@@ -425,7 +425,7 @@ class ExportConfig(RobotModelFlag):
 
     GROUPS: ClassVar[Groups] = {
         "The checkpoint": ("env", "robot_model", "set", "out", "force"),
-        "A policy of LeRobot": ("units", "data", "served", "task"),
+        "A policy of LeRobot": ("units", "data", "chunk", "served", "task"),
         "A policy of stable-baselines3 or RLlib": ("algo", "policy", "statistics", "trust_pickle"),
     }
 
@@ -441,6 +441,9 @@ class ExportConfig(RobotModelFlag):
     """What LeRobot's joints are in: degrees, -100 to 100 of their range (range), or radians and metres (si)."""
     data: Folder = None
     """LeRobot's data set, which names the numbers; by default where the policy was trained."""
+    chunk: Assignments = ()
+    """How LeRobot's chunks are used, where otherwise than it says: steps=20, ensemble=0.01 (temporal ensembling),
+    overlap=10 (real-time chunking of SmolVLA and pi0), when_lost=halt; any number of times."""
     served: bool = False
     """LeRobot computes its chunks, on a policy server: the checkpoint has no network, and bam-serve --policy, on this
     computer, serves it. For policies that are too large for a robot's computer, such as SmolVLA."""

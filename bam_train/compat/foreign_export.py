@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from bam_train.deploy.contract import Contract
 from bam_train.environments import described, make_env
 from bam_train.errors import CheckpointError, ContractRefused, PolicyError
 from bam_train.policy import FrozenPolicy
+from bam_train.policy.chunks import KNOWN, LEFT
 from bam_train.policy.onnx_session import OnnxSession, Tensor
 
 Array = NDArray[Any]
@@ -51,6 +52,11 @@ def export_foreign(
         ContractRefused: A joint is missing, or named twice; the rate or an image differs.
         PolicyError: Its graph cannot be used, or does not act as its own library does.
     """
+    if policy.network and policy.chunk.overlap is not None:
+        text = (
+            "overlap: its graph makes each chunk by itself; LeRobot's SmolVLA and pi0, which are --served, continue one"
+        )
+        raise PolicyError(f"{policy.place}: {text}")
     policy = with_known_sizes(policy) if policy.network else policy
     env_kwargs = {**_usual(policy, env_id), **env_kwargs}
     session, frozen, graph, (signals, period) = _joined(policy, env_id, env_kwargs, tell)
@@ -77,7 +83,8 @@ def served_policy(checkpoint: Checkpoint) -> FrozenPolicy:
     if not folder.is_dir():
         text = f"LeRobot computes its chunks, out of {folder}, which is not there. Export it again, on this computer"
         raise CheckpointError(checkpoint.path, text)
-    policy = lerobot_policy(folder, data=data, units=source["units"], served=True, task=source["task"])
+    options: Any = {"units": source["units"], "task": source["task"], "chunk": asdict(manifest.chunk)}  # type: ignore[arg-type]
+    policy = lerobot_policy(folder, data=data, served=True, **options)
     _, frozen, _, _ = _joined(policy, manifest.env, manifest.env_kwargs)
     frozen.require_golden(checkpoint)
     return frozen
@@ -134,15 +141,20 @@ class LibrarySession:
         shape: tuple[int, ...],
     ) -> None:
         self.policy, self.taken, self.given, self.shape = policy, taken, given, shape
-        self._answer = policy.answer or _graph(policy)
+        self._answer, self._ports = policy.answer or _graph(policy), policy.inputs
         past = (policy.chunk.history,) if policy.chunk.history > 1 else ()
         parts = taken.values()
         self.inputs = {name: Tensor((1, *past, *part.shape), part.dtype.name) for name, part, _ in parts}
+        if policy.chunk.overlap is not None:
+            self._ports = (*self._ports, replace(policy.output, name=LEFT))
+            self.inputs |= {LEFT: Tensor((1, policy.chunk.size, *shape), "float32"), KNOWN: Tensor((1, 2), "int64")}
 
     def run(self, inputs: Mapping[str, Array], _: Sequence[str]) -> list[Array]:
         """The chunk, (1, size, ...), for arrays (1, ...)."""
         ours = {name: (inputs[ours], means) for name, (ours, _, means) in self.taken.items()}
-        chunk = np.asarray(self._answer(as_theirs(self.policy, ours)))
+        ours |= {name: (inputs[name], self.given) for name in inputs if name == LEFT}
+        known = {name: inputs[name] for name in inputs if name == KNOWN}
+        chunk = np.asarray(self._answer({**as_theirs(self._ports, ours), **known}))
         return [as_ours(self.policy, chunk, self.given, self.shape)[None]]
 
 
@@ -164,8 +176,9 @@ def _detector(
     policy: ForeignPolicy, taken: Mapping[str, tuple[str, Any, Meaning]], given: Meaning, count: int
 ) -> Detector | None:
     """The detector of unusual observations, of the ranges of the numbers in the data; None if they are not known."""
-    seen = sorted((taken[port.name], port) for port in policy.inputs if not port.is_image)
-    ranges = [_range(port, means, math.prod(part.shape)) for (_, part, means), port in seen]
+    seen = {taken[port.name][0]: port for port in policy.inputs if not port.is_image}
+    found = [(port, *taken[port.name][1:]) for _, port in sorted(seen.items())]
+    ranges = [_range(port, means, math.prod(part.shape)) for port, part, means in found]
     d = sum(len(low) for low, _ in ranges)
     low, high = np.concatenate([*ranges, _range(policy.output, given, count)], axis=1)
     few = 0 < d <= MOST_NUMBERS and len(low) - d <= MOST_NUMBERS
@@ -228,6 +241,10 @@ def _golden(session: LibrarySession) -> dict[str, Array]:
         drawn = np.zeros((rows, *past, *part.shape))
         drawn[..., means.order] = means.si(port.data(rng.normal(size=(rows, *past, len(means.order)))))
         arrays[name] = np.clip(drawn, part.low, part.high).astype(part.dtype)
+    if policy.chunk.overlap is not None:
+        numbers = rng.normal(size=(rows * policy.chunk.size, *policy.output.size))
+        arrays[LEFT] = as_ours(policy, numbers, session.given, session.shape).reshape(rows, -1, *session.shape)
+        arrays[KNOWN] = np.array([[k % 2 * policy.chunk.size // 2, k % 2] for k in range(rows)])
     chunks = [session.run({name: array[k : k + 1] for name, array in arrays.items()}, ())[0][0] for k in range(rows)]
     return {**arrays, "action": np.stack(chunks)}
 

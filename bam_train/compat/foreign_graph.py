@@ -147,10 +147,10 @@ def _by_channel(port: Port) -> Affine:
     return Affine(norm.scale.reshape(-1, 1, 1), norm.offset.reshape(-1, 1, 1))
 
 
-def as_theirs(policy: ForeignPolicy, taken: Mapping[str, tuple[Array, Meaning]]) -> dict[str, Array]:
+def as_theirs(ports: Sequence[Port], taken: Mapping[str, tuple[Array, Meaning]]) -> dict[str, Array]:
     """Arrays of ours, by names of inputs, as the network takes them: what the nodes compute, in NumPy."""
     inputs = {}
-    for port in policy.inputs:
+    for port in ports:
         array, means = taken[port.name]
         if port.is_image:
             pixels = np.moveaxis(array.astype(np.float64), -1, -3)

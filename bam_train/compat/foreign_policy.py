@@ -280,7 +280,7 @@ def part_key(space: gym.Space[Any], port: Port) -> str:
     vectors = [key for key, leaf in _parts(space).items() if len(leaf.shape or ()) == 1]
     if port.is_image or port.part in _parts(space) or len(vectors) != 1:
         return port.part
-    return vectors[0] if port.part in ("", "state") else port.part
+    return vectors[0] if port.part in ("", "state", "environment_state") else port.part
 
 
 @dataclass(frozen=True)

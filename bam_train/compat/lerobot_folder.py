@@ -7,10 +7,13 @@ where the policy runs. Any policy with chunks is served: LeRobot computes them o
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,11 +21,13 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from bam_envs.core.validation import read_table
 from bam_train.checkpoint import safetensors_file
 from bam_train.checkpoint.manifest import Chunk
 from bam_train.compat.foreign_policy import PIXEL, ForeignPolicy, Port, Units
 from bam_train.data import DataSet
 from bam_train.errors import CheckpointError, CheckpointMismatch, FormatError, SettingsError
+from bam_train.policy.chunks import KNOWN, LEFT
 from bam_train.trainers.frozen_network import Layer, trace
 
 Array = NDArray[Any]
@@ -38,11 +43,23 @@ _STEPS = {
     "unnormalizer_processor",
 }
 """Steps of processors that are known; each of the others may change the numbers."""
-_ENDS = {"MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q10", "q90")}
+_BY = {
+    "MEAN_STD": ("mean", "std"),
+    "MIN_MAX": ("min", "max"),
+    "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+}
+"""Statistics by which numbers are normalised."""
 
 
 def lerobot_policy(
-    folder: Path, *, data: Path | None = None, units: Units | None = None, served: bool = False, task: str = ""
+    folder: Path,
+    *,
+    data: Path | None = None,
+    units: Units | None = None,
+    served: bool = False,
+    task: str = "",
+    chunk: Mapping[str, Any] = MappingProxyType({}),
 ) -> ForeignPolicy:
     """The policy in a folder ``pretrained_model``.
 
@@ -52,6 +69,7 @@ def lerobot_policy(
         units: What joints are measured in: degrees, or -100 to 100 of their range; a gripper is 0 to 100 in both.
         served: Whether LeRobot computes its chunks where it runs, instead of a graph.
         task: What it is told to do, if it reads that.
+        chunk: What differs from its own `Chunk`.
 
     Raises:
         CheckpointError: The folder is missing, or has no policy of LeRobot in it.
@@ -73,7 +91,7 @@ def lerobot_policy(
         )
         raise SettingsError(f"{folder}: {text}")
     theirs = {new: old for old, new in renamed.items()}
-    network = _Library(folder, kind, task, theirs) if served else _Network(folder, kind)
+    network = _Library(folder, kind, task, theirs, chunk) if served else _Network(folder, kind, chunk)
     norms = {name: _norms(folder, found) for name, found in steps.items()}
 
     def port(feature: str, shape: tuple[int, ...], norm: Norm) -> Port:
@@ -126,9 +144,23 @@ def _kind(folder: Path, config: Mapping[str, Any], served: bool) -> str:
     return kind
 
 
+@contextmanager
+def _reading(folder: Path, kind: str) -> Iterator[None]:
+    """What LeRobot raises of a folder, as errors of ours."""
+    try:
+        yield
+    except ImportError as error:
+        text = f"{folder}: LeRobot makes the network, and {error.name or 'lerobot'} is not installed"
+        raise SettingsError(f'{text}. Run: pip install "lerobot{"" if kind in KINDS else f"[{kind}]"}"') from error
+    except Exception as error:  # of any kind: its configuration, weights and processors have readers of their own
+        text = f"LeRobot {version('lerobot')} cannot load it: {' '.join(str(error).split()):.160}"
+        remedy = "Copy the folder whole, or export it with the version of LeRobot that trained it"
+        raise CheckpointMismatch(folder, f"{text.rstrip('.')}. {remedy}") from error
+
+
 def _loaded(folder: Path, kind: str) -> Any:
     """The policy, as LeRobot makes it."""
-    try:
+    with _reading(folder, kind):
         if kind in KINDS:
             made = getattr(import_module(f"lerobot.policies.{kind}.modeling_{kind}"), KINDS[kind])
         else:
@@ -137,9 +169,6 @@ def _loaded(folder: Path, kind: str) -> Any:
         if kind in KINDS:
             config.pretrained_backbone_weights = None  # else they are downloaded, and then replaced by its own
         return made.from_pretrained(folder, config=config)
-    except ImportError as error:
-        text = f"{folder}: LeRobot makes the network, and {error.name or 'lerobot'} is not installed"
-        raise SettingsError(f'{text}. Run: pip install "lerobot{"" if kind in KINDS else f"[{kind}]"}"') from error
 
 
 def _features(config: Any) -> dict[str, tuple[int, ...]]:
@@ -156,15 +185,24 @@ class _Library:
     Noise that it draws is the same for each chunk, so that its actions can be compared.
     """
 
-    def __init__(self, folder: Path, kind: str, task: str, theirs: Mapping[str, str]) -> None:
+    def __init__(self, folder: Path, kind: str, task: str, theirs: Mapping[str, str], asked: Mapping[str, Any]) -> None:
         self._policy, self._task, self._theirs = _loaded(folder, kind).eval(), task, theirs
         config, self.version = self._policy.config, version("lerobot")
         own = {"device_processor": {"device": str(config.device)}}
         make = import_module("lerobot.policies.factory").make_pre_post_processors
-        self._before, self._after = make(config, pretrained_path=str(folder), preprocessor_overrides=own)
+        with _reading(folder, kind):
+            self._before, self._after = make(config, pretrained_path=str(folder), preprocessor_overrides=own)
         self.features, self.shape = _features(config), tuple(config.action_feature.shape)
         ensemble = getattr(config, "temporal_ensemble_coeff", None)
-        self.chunk = Chunk(config.chunk_size, config.n_action_steps, 1, ensemble)
+        self.chunk = _chunk(folder, Chunk(config.chunk_size, config.n_action_steps, 1, ensemble), asked)
+        if self.chunk.overlap is not None:
+            if not hasattr(self._policy, "init_rtc_processor"):
+                raise CheckpointMismatch(
+                    folder, f"overlap: {kind} makes each chunk by itself; SmolVLA and pi0 continue one"
+                )
+            rtc: Any = import_module("lerobot.policies.rtc.configuration_rtc")
+            config.rtc_config = rtc.RTCConfig(enabled=True, execution_horizon=self.chunk.overlap)
+            self._policy.init_rtc_processor()
 
     def graph(self, folder: Path) -> bytes:
         """None: LeRobot computes."""
@@ -173,9 +211,15 @@ class _Library:
     def answer(self, inputs: Mapping[str, Array]) -> Array:
         """The chunk for arrays (1, ...) by feature."""
         frame: dict[str, Any] = {self._theirs.get(name, name): torch.tensor(inputs[name][0]) for name in self.features}
+        steps, delay = inputs[KNOWN][0].tolist() if KNOWN in inputs else (0, 0)
+        if steps:
+            frame[_ACTION] = torch.tensor(inputs[LEFT][0, :steps])  # normalised as in training
         torch.manual_seed(0)
         with torch.no_grad():
-            chunk = self._policy.predict_action_chunk(self._before({**frame, "task": self._task}))
+            batch = self._before({**frame, "task": self._task})
+            left = batch.pop(_ACTION, None)
+            guide = {} if left is None else {"prev_chunk_left_over": left, "inference_delay": delay}
+            chunk = self._policy.predict_action_chunk(batch, **guide)
             return np.asarray(self._after(chunk[0]).cpu().numpy(), np.float32)[None]
 
 
@@ -195,7 +239,7 @@ class _CenterCrop(Layer):
 class _Network(Layer):
     """LeRobot's network, from normalised features to a chunk of normalised actions; Diffusion begins at fixed noise."""
 
-    def __init__(self, folder: Path, kind: str) -> None:
+    def __init__(self, folder: Path, kind: str, asked: Mapping[str, Any]) -> None:
         super().__init__()
         policy = _loaded(folder, kind)
         config, self.version = policy.config, version("lerobot")
@@ -212,6 +256,7 @@ class _Network(Layer):
                 if hasattr(part, "center_crop"):
                     part.center_crop = _CenterCrop(part.center_crop.size)
             self.noise = torch.randn(1, config.horizon, *self.shape, generator=torch.Generator().manual_seed(0))
+        self.chunk = _chunk(folder, self.chunk, asked)
         self.eval()
 
     def graph(self, folder: Path) -> bytes:
@@ -228,7 +273,8 @@ class _Network(Layer):
         """The chunk, (1, size, k)."""
         batch: dict[str, Any] = dict(zip(self.features, features, strict=True))
         if self.noise is None:
-            batch["observation.images"] = [batch[name] for name in self.images]
+            if self.images:
+                batch["observation.images"] = [batch[name] for name in self.images]
             chunk: torch.Tensor = self.model(batch)[0]
             return chunk
         if self.chunk.history == 1:
@@ -245,6 +291,19 @@ class _Network(Layer):
             return np.asarray(self(*(torch.as_tensor(inputs[name]) for name in self.features)).numpy())
 
 
+def _chunk(folder: Path, own: Chunk, asked: Mapping[str, Any]) -> Chunk:
+    """A policy's own `Chunk` with what is asked for otherwise."""
+    try:
+        chunk = read_table(Chunk, {**asdict(own), **asked}, "--chunk")
+    except ValueError as error:
+        raise SettingsError(f"{folder}: {error}") from error
+    if (chunk.size, chunk.history) != (own.size, own.history):
+        raise SettingsError(
+            f"{folder}: --chunk: its size is {own.size}, and its history {own.history}; leave these out"
+        )
+    return chunk
+
+
 def _norms(folder: Path, steps: list[dict[str, Any]]) -> Any:
     """A function of a feature and its shape: how a processor normalises it."""
     found = [step for step in steps if str(step.get("registry_name")).endswith("normalizer_processor")]
@@ -252,20 +311,25 @@ def _norms(folder: Path, steps: list[dict[str, Any]]) -> Any:
     def norm(feature: str, shape: tuple[int, ...]) -> Norm:
         mean, std, ends = np.zeros(shape[0]), np.ones(shape[0]), (np.zeros(0), np.zeros(0))
         for step in found:
-            config, arrays = step["config"], _statistics(folder, step["state_file"])
+            config, file = step["config"], step.get("state_file", "its processor")
+            arrays = _statistics(folder, file) if "state_file" in step else {}
             stats = {key.rpartition(".")[2]: value for key, value in arrays.items() if key.startswith(f"{feature}.")}
             numbers = {key: np.ravel(value).astype(np.float64) for key, value in stats.items()}
             ends = numbers.get("min", ends[0]), numbers.get("max", ends[1])
             mode = config["norm_map"].get(config["features"].get(feature, {}).get("type"), "IDENTITY")
-            if mode == "IDENTITY" or not stats:
+            if mode == "IDENTITY":
                 continue
-            if mode != "MEAN_STD" and mode not in _ENDS:
+            if mode not in _BY:
                 raise CheckpointMismatch(folder, f"normalises {feature} by {mode}, which is not known here")
-            eps = float(config["eps"])
+            if missing := [key for key in _BY[mode] if key not in numbers]:
+                text = (
+                    f"{feature} is normalised by its {' and '.join(missing)}, missing in {file}. Copy the folder whole"
+                )
+                raise CheckpointError(folder, f"{text}, or save the policy again", member=file)
+            eps, (low, high) = float(config["eps"]), (numbers[key] for key in _BY[mode])
             if mode == "MEAN_STD":
-                mean, std = numbers["mean"], numbers["std"] + (0.0 if feature == _ACTION else eps)
+                mean, std = low, high + (0.0 if feature == _ACTION else eps)
             else:
-                low, high = (numbers[key] for key in _ENDS[mode])
                 span = np.where(high == low, eps, high - low)
                 mean, std = span / 2 + low, span / 2
         return mean, std, *ends
@@ -282,12 +346,18 @@ def _statistics(folder: Path, name: str) -> dict[str, Array]:
 
 def _steps(folder: Path, name: str, served: bool) -> list[dict[str, Any]]:
     """The steps of a processor; each of them must be known, unless LeRobot computes them."""
-    steps: list[dict[str, Any]] = _json(folder, name)["steps"]
+    if not (folder / name).is_file():
+        text = f"has no {name}, as LeRobot before 0.4 kept statistics with the weights. With a newer one, run"
+        module = "python -m lerobot.processor.migrate_policy_normalization --pretrained-path"
+        raise CheckpointMismatch(folder, f"{text} {module} {folder}")
+    steps = _json(folder, name).get("steps")
+    if not isinstance(steps, list) or not all(isinstance(one, dict) for one in steps):
+        raise CheckpointError(folder, f"{name} has no list of steps", member=name)
     for step in [] if served else steps:
         if step.get("registry_name") not in _STEPS:
             found = step.get("registry_name") or step.get("class")
             raise CheckpointMismatch(folder, f"{name} has the step {found}, which is not known here")
-    return steps
+    return [{"config": {}, **one} for one in steps]
 
 
 def _data_set(folder: Path, given: Path | None) -> tuple[dict[str, Any], Path]:

@@ -21,6 +21,8 @@ from bam_train.data.layout import (
     DEFAULTS,
     EPISODES,
     INFO,
+    STATE,
+    STATE_ALONE,
     STATS,
     TASKS,
     Files,
@@ -171,7 +173,8 @@ class DataSetWriter:
     def _extra_column(self, name: str, values: Any, steps: int) -> Array:
         array = np.asarray(values)
         found = kind_of(array)
-        if "/" in name or name in DEFAULTS or name.startswith(("observation.", "action", "next.", "bam")):
+        taken = name.startswith(("observation.", "action", "next.", "bam")) and name not in (STATE, STATE_ALONE)
+        if "/" in name or name in DEFAULTS or taken or name in {one.column for one in self._observation}:
             raise BadDataSet(f"{self._files.text}: a column cannot be called {name!r}; choose another name")
         if array.shape[:1] != (steps,):
             raise BadDataSet(f"{self._files.text}: column {name}: expected {steps} steps, found shape {array.shape}")

@@ -50,6 +50,8 @@ DEFAULTS = {"timestamp": "float32", "frame_index": "int64", "episode_index": "in
     "task_index": "int64"
 }
 """Columns that LeRobot needs."""
+STATE, STATE_ALONE = "observation.state", "observation.environment_state"
+"""What LeRobot's networks call a vector beside images, and one without any."""
 NEXT = ("next.reward", "next.done", "next.terminated", "next.truncated", "next.success")
 FINAL = "bam/final/"
 """Prefix of the columns of an episodes file with the last observation."""

@@ -93,7 +93,7 @@ class Background:
             plan.repeat()
         plan.see(self.policy.checked(observation))
         self._receive()
-        lead = math.ceil(SPARE * max(self._took, default=0.0) / self._period) + 1
+        lead = plan.delay = math.ceil(SPARE * max(self._took, default=0.0) / self._period) + 1
         if self._asked is None and plan.is_due(lead):
             self._ask()
         if not (plan.tick or plan.has_action):

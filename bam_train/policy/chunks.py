@@ -17,6 +17,9 @@ Array = NDArray[Any]
 ONE_BY_ONE = "it gives one action at a time, and has no chunks to plan"
 FADE = 8
 """Least number of steps in which one chunk takes over from another, 0.4 s at 20 Hz."""
+LEFT, KNOWN = "chunk.left", "chunk.known"
+"""Inputs of a policy with an `overlap`: what is left of the chunk before for the next steps, filled up with zeros,
+(size, ...); and for how many steps, and how many of these pass until a new one comes, (2,)."""
 STEEPEST = 1.5
 """Greatest slope of 3 w^2 - 2 w^3, by which a change-over fades."""
 
@@ -59,6 +62,8 @@ class Plan:
         """Steps executed so far."""
         self.tick = 0
         """Steps so far, those among them in which a guard held the robot."""
+        self.delay = 0
+        """Steps that the next chunk may take to come."""
         self._answers: list[_Answer] = []
         self._seen: deque[Mapping[str, Array]] = deque(maxlen=chunk.history)
 
@@ -71,7 +76,15 @@ class Plan:
     def seen(self) -> dict[str, Array]:
         """The graph's inputs for this step, without a batch axis."""
         last = self._seen[-1]
-        return dict(last) if self.chunk.history == 1 else {k: np.stack([o[k] for o in self._seen]) for k in last}
+        seen = dict(last) if self.chunk.history == 1 else {k: np.stack([o[k] for o in self._seen]) for k in last}
+        return seen if self.chunk.overlap is None else {**seen, **self._left()}
+
+    def _left(self) -> dict[str, Array]:
+        """The inputs of an `overlap`."""
+        left, old = np.zeros((self.chunk.size, *self._shape), np.float32), self._answers[-1:]
+        values = [self._value(one, k) for one in old for k in range(self.step, one.begun + self.chunk.size)]
+        left[: len(values)] = np.reshape(values, (-1, *self._shape))
+        return {LEFT: left, KNOWN: np.array([len(values), min(self.delay, len(values))], np.int64)}
 
     def is_due(self, lead: int = 0) -> bool:
         """Whether the next chunk should be asked for, which may take `lead` steps to come."""

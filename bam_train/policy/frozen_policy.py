@@ -16,7 +16,7 @@ from bam_train.checkpoint import GOLDEN, POLICY, Checkpoint
 from bam_train.checkpoint.detector import Detector
 from bam_train.checkpoint.manifest import Chunk
 from bam_train.errors import FormatError, PolicyError
-from bam_train.policy.chunks import ONE_BY_ONE, Plan
+from bam_train.policy.chunks import KNOWN, LEFT, ONE_BY_ONE, Plan
 
 if TYPE_CHECKING:
     from bam_train.policy.onnx_session import PolicyRunner
@@ -128,6 +128,9 @@ class FrozenPolicy:
         self.chunk, self._plans = chunk, list[Plan]()
         past = () if chunk is None or chunk.history == 1 else (chunk.history,)
         self.taken = [replace(part, shape=(*past, *part.shape)) for part in self._arrays]
+        if chunk is not None and chunk.overlap is not None:
+            self.taken.append(ArraySpec(LEFT, "Box", self.answer_shape, np.dtype(np.float32)))
+            self.taken.append(ArraySpec(KNOWN, "Box", (2,), np.dtype(np.int64)))
         _require_fit(session, self.taken, states)
         self._zero_state = {name: np.zeros([n or 1 for n in spec.shape], spec.dtype) for name, spec in states.items()}
         self._state: dict[str, np.ndarray] | None = None
@@ -281,7 +284,7 @@ class FrozenPolicy:
         due = [plan for plan in self._plans if plan.is_due()]
         if due:
             seen = [plan.seen() for plan in due]
-            chunks = self.answer({name: np.stack([one[name] for one in seen]) for name in inputs})
+            chunks = self.answer({name: np.stack([one[name] for one in seen]) for name in seen[0]})
             for plan, chunk in zip(due, chunks, strict=True):
                 plan.add(plan.step, chunk)
         return np.stack([plan.take() for plan in self._plans])
@@ -349,7 +352,7 @@ class FrozenPolicy:
 
     def require_rows(self, golden: Mapping[str, np.ndarray]) -> int:
         """The number of rows of recorded arrays; raises PolicyError where they do not fit the policy."""
-        names = {"action", *(part.name for part in self._arrays)}
+        names = {"action", *(part.name for part in self.taken)}
         if set(golden) != names:
             raise PolicyError(f"expected the arrays {sorted(names)}, found {sorted(golden)}")
         rows = {name: array.shape[:1] for name, array in golden.items()}
@@ -366,7 +369,7 @@ class FrozenPolicy:
         """The action, or the chunk, for a row of recorded arrays."""
         if self.chunk is None:
             return self.act(self.recorded(golden, row))
-        return self.answer({part.name: golden[part.name][row][None] for part in self._arrays})[0]
+        return self.answer({part.name: golden[part.name][row][None] for part in self.taken})[0]
 
     def recorded(self, golden: Mapping[str, np.ndarray], rows: Any) -> Any:
         """The observations in these rows of recorded arrays, as `act` or `act_batch` takes them."""

@@ -12,8 +12,10 @@ if "+cpu" in torch.__version__:
     library = torch.library.Library("torchvision", "DEF")
     for name in ("nms", "qnms"):
         library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-# Half a gigabyte that draws with --display_data, which is not given.
+# Half a gigabyte that draws with --display_data, which is not given; and the colours of words.
 sys.modules["rerun"] = types.ModuleType("rerun")
+sys.modules["termcolor"] = colours = types.ModuleType("termcolor")
+colours.colored = lambda text, *_, **__: text
 
 if __name__ == "__main__":
     importlib.import_module(sys.argv.pop(1)).main()

@@ -68,7 +68,7 @@ def read(root, tmp_path):
     return lerobot_python(tmp_path, READER, root, "0.05", tmp_path / "cache")
 
 
-POLICIES = ("act-null", "act-0.1", "diffusion-null", "act-null-served")
+POLICIES = ("act-null", "act-0.1", "diffusion-null", "act-null-served", "flow-null-served")
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +82,75 @@ def exported(tmp_path_factory):
 @pytest.mark.parametrize("name", POLICIES)
 def test_an_exported_policy_acts_as_in_lerobot(exported, name):
     assert exported[1][name] <= 1e-5
+
+
+LOADS_NOT = (
+    "LeRobot 0.4.4 cannot load it: {}. Copy the folder whole, or export it with the version of LeRobot that trained it"
+)
+NORMALIZED = "observation.{} is normalised by its {}, missing in {}. Copy the folder whole, or save the policy again"
+STATISTICS = "policy_preprocessor_step_3_normalizer_processor.safetensors"
+SIZE = (
+    "Error(s) in loading state_dict for ACTPolicy: size mismatch for model.vae_encoder_pos_enc: copying a param with "
+    "shape torch.Size([1, 10, 32]) from checkpoint, t"
+)
+REFUSED = {
+    "no processors": "has no policy_preprocessor.json, as LeRobot before 0.4 kept statistics with the weights. With a "
+    "newer one, run python -m lerobot.processor.migrate_policy_normalization --pretrained-path FOLDER",
+    "unknown step": "policy_preprocessor.json has the step delta_action_processor, which is not known here",
+    "no file of statistics": f"{STATISTICS} cannot be read: [Errno 2] No such file or directory: 'FOLDER/{STATISTICS}'",
+    "no statistics": NORMALIZED.format("images.front", "mean and std", "its processor"),
+    "no mean": NORMALIZED.format("state", "mean", STATISTICS),
+    "none of an input": NORMALIZED.format("state", "mean and std", STATISTICS),
+    "another version": LOADS_NOT.format("The fields `attention_of_tomorrow` are not valid for ACTConfig"),
+    "another size": LOADS_NOT.format(SIZE),
+    "chunk of zero": LOADS_NOT.format(SIZE),
+    "no weights": LOADS_NOT.format("No such file or directory: FOLDER/model.safetensors"),
+    "cut weights": LOADS_NOT.format("Error while deserializing header: header too small"),
+    "no steps": "policy_preprocessor.json has no list of steps",
+    "size=5": "--chunk: its size is 8, and its history 1; leave these out",
+    "steps=9": "chunk: steps is 9, expected at most its size, 8",
+    "ensemble=much": "--chunk: ensemble: expected a number, found 'much'",
+    "stpes=4": "--chunk: unknown key 'stpes'. Did you mean 'steps'?",
+    "overlap=4": "overlap: its graph makes each chunk by itself; LeRobot's SmolVLA and pi0, which are --served, "
+    "continue one",
+}
+
+
+@pytest.mark.slow
+def test_a_folder_of_lerobot_that_cannot_be_exported_is_one_line(exported, tmp_path):
+    found = lerobot_python(tmp_path, HERE / "lerobot_refused.py", exported[0] / "act-null", tmp_path / "copies")
+    assert found == {name: [f"bam-export: FOLDER: {text}"] for name, text in REFUSED.items()}
+
+
+TWO_CAMERAS = ("--set", 'camera=["front","wrist"]', "--set", "image_size=32")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seen", [TWO_CAMERAS, ()], ids=["two cameras", "states only"])
+def test_what_lerobot_trains_on_our_data_is_exported_and_acts_as_there(tmp_path, seen):
+    """On 100 recorded frames; then it drives the arm in simulation."""
+    data = ["-m", "bam_train.cli.data.bam_data"]
+    options = ["--env", "bam/pick", "--policy", "scripted", "--episodes", "3", *seen]
+    lerobot_program(tmp_path, *data, "collect", "recorded", *options)
+    lerobot_program(tmp_path, *data, "export", "recorded", "--to", "lerobot", "--out", "data")
+    small = [
+        "chunk_size=8",
+        "n_action_steps=4",
+        "dim_model=32",
+        "n_heads=2",
+        "dim_feedforward=32",
+        "n_encoder_layers=1",
+    ]
+    small += ["type=act", "pretrained_backbone_weights=null", "device=cpu", "push_to_hub=false"]
+    flags = ["--dataset.repo_id=bam/data", "--dataset.root=data", "--output_dir=out", "--num_workers=0", "--steps=30"]
+    flags += [f"--policy.{one}" for one in small]
+    lerobot_program(tmp_path, HERE / "lerobot_beside_torch.py", "lerobot.scripts.lerobot_train", *flags)
+    folder = tmp_path / "out" / "checkpoints" / "last" / "pretrained_model"
+    found = lerobot_python(tmp_path, HERE / "lerobot_trained.py", "data", folder, "act.zip")
+    assert found["worst"] <= 1e-5
+    assert found["largest"] > 0.1
+    deploy = ["-m", "bam_train.cli.deploy", "act.zip", "--episodes", "1", "--fast", "--json"]
+    assert lerobot_python(tmp_path, *deploy)["stop_reason"] == "episodes done"
 
 
 @pytest.mark.slow

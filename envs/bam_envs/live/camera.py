@@ -94,28 +94,43 @@ class LiveCamera:
             ProtocolError: It is not an image.
             MissingExtra: Pillow is not installed.
         """
-        letter = None if self._link is None else self._mailbox.newest().get(_SLOT)
-        if letter is None:
-            raise ResetNeeded(f"The camera {self.source.name} at {self.url} is not connected. Call connect() first.")
-        # Compared with the quickest image by their stamps: a link that hung delivers old images late.
-        self._age.look(letter, self._topic, None)
+        letter = self._newest()
         age, limit = self._age.at(self._clock()), self.source.max_age
         if age > limit:
             what = f"{self._topic}: the newest image is {age:.3f} s old, and at most {limit:g} s are allowed."
             raise StaleState(what, age, limit)
-        if self._decoded is None or self._decoded.number != letter.number:
-            pixels = decode_pixels(letter.message, self._topic)
-            self._decoded = CameraImage(pixels, self._age.stamp, letter.number)
-        return self._decoded
+        return self._decode(letter)
 
-    def await_stamp(self, stamp: float) -> None:
-        """Wait until an image with this stamp or a later one has come, for as long as one is fresh."""
+    def taken_at(self, stamp: float, timeout: float, ends: Callable[[], bool]) -> CameraImage:
+        """The newest image, once one with this stamp or a later one has come: its age is that of the state.
+
+        `StaleState` if none comes within `timeout` [s], or before the wait `ends`; else as `latest`.
+        """
 
         def came(slots: Mapping[str, Letter]) -> bool:
             taken = None if _SLOT not in slots else read_stamp(slots[_SLOT].message, self._topic)
             return taken is not None and taken >= stamp
 
-        self._mailbox.wait_for(came, self.source.max_age)
+        last = time.monotonic() + timeout
+        while not self._mailbox.wait_for(came, self.source.max_age):
+            if ends() or time.monotonic() > last:
+                raise StaleState(f"{self._topic}: no image of the newest state in {timeout:g} s. Does the camera run?")
+        return self._decode(self._newest())
+
+    def _newest(self) -> Letter:
+        """The newest image, whose stamp is read."""
+        letter = None if self._link is None else self._mailbox.newest().get(_SLOT)
+        if letter is None:
+            raise ResetNeeded(f"The camera {self.source.name} at {self.url} is not connected. Call connect() first.")
+        # Compared with the quickest image by their stamps: a link that hung delivers old images late.
+        self._age.look(letter, self._topic, None)
+        return letter
+
+    def _decode(self, letter: Letter) -> CameraImage:
+        if self._decoded is None or self._decoded.number != letter.number:
+            pixels = decode_pixels(letter.message, self._topic)
+            self._decoded = CameraImage(pixels, self._age.stamp, letter.number)
+        return self._decoded
 
     def file(self) -> tuple[int, str, bytes] | None:
         """Number, ``"png"`` or ``"jpeg"``, and bytes of the newest image, as they arrived; None for anything else."""

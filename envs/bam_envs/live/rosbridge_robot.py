@@ -540,13 +540,15 @@ class RosbridgeRobot:
         self._connected()
         try:
             signals, stamp = self._state.read()
+            for name, (camera, box) in self._cameras.items():
+                if self.info.lockstep:  # no time passes; its image comes over another connection
+                    image = camera.taken_at(stamp, self._answer_timeout, self._cut.is_set)
+                else:
+                    image = camera.latest()
+                signals[name] = fitted(image.pixels, box)[None]
         except StaleState:
             self._require_link()  # one that is down is why
             raise
-        for name, (camera, box) in self._cameras.items():
-            if self.info.lockstep:  # no time passes: its image comes over another connection
-                camera.await_stamp(stamp)
-            signals[name] = fitted(camera.latest().pixels, box)[None]
         command = self._at_rest(signals) if self._sent is None else self._sent
         return RobotState(signals, np.array([stamp]), command[None].copy())
 

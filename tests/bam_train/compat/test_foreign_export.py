@@ -223,6 +223,11 @@ def test_a_network_without_its_description(run, tmp_path):
     ("changes", "message"),
     [
         (
+            [("chunk = { size", "chunk = { overlap = 2, size")],
+            "overlap: its graph makes each chunk by itself; LeRobot's SmolVLA and pi0, which are --served, continue "
+            "one",
+        ),
+        (
             [("chunk = { size = 2", "chunk = { size = 3")],
             "output actions: the graph gives [2, 6], and [3, 6] is described. Correct the size of the chunk, or its "
             "names",

@@ -19,7 +19,7 @@ from bam_train.deploy.journal import Ending, Journal
 from bam_train.errors import CheckpointError, PolicyError
 from bam_train.policy import FrozenPolicy
 from bam_train.policy.background import Background
-from bam_train.policy.chunks import FADE, STEEPEST, Plan
+from bam_train.policy.chunks import FADE, KNOWN, LEFT, STEEPEST, Plan
 from tests.bam_train.checkpoint.test_checkpoint import FIELDS
 from tests.bam_train.policy.test_frozen_policy import onnx_of
 
@@ -74,6 +74,19 @@ def test_all_chunks_of_a_step_are_averaged_and_the_oldest_counts_most():
 
 def test_the_last_observations_are_seen_and_the_first_one_stands_for_those_before():
     assert acts(chunked(Chunk(size=1, steps=1, history=3)), 1, 2, 3) == [201.0, 202.0, 303.0]
+
+
+def test_with_an_overlap_what_is_left_of_the_chunk_before_is_seen():
+    plan = Plan(Chunk(size=4, steps=2, overlap=3), (1,))
+    plan.see({"observation": np.ones(1)})
+    assert (plan.seen()[LEFT].tolist(), plan.seen()[KNOWN].tolist()) == ([[0.0]] * 4, [0, 0])
+    plan.add(0, np.array([[1.0], [2.0], [3.0], [4.0]]))
+    plan.take()
+    plan.delay = 1
+    assert (plan.seen()[LEFT].tolist(), plan.seen()[KNOWN].tolist()) == ([[2.0], [3.0], [4.0], [0.0]], [3, 1])
+    plan.take()
+    plan.delay = 5  # a chunk that takes long: all that is left passes until it comes
+    assert (plan.seen()[LEFT].tolist(), plan.seen()[KNOWN].tolist()) == ([[3.0], [4.0], [0.0], [0.0]], [2, 2])
 
 
 def test_a_checkpoint_has_the_chunks_and_compares_them(tmp_path):

@@ -1,0 +1,87 @@
+"""Damage copies of a folder ``pretrained_model`` in several ways; print what `bam-export` says of each, as JSON.
+
+The arguments are the folder of a policy that `lerobot_policy` made, and a folder for the copies.
+"""
+
+import contextlib
+import io
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import lerobot_beside_torch  # noqa: F401
+from safetensors.numpy import load_file, save_file
+
+from bam_train.cli.export import main
+
+made, copies = Path(sys.argv[1]), Path(sys.argv[2])
+STATE, FLAGS = "observation.state", ("--robot-model", "so101", "--units", "degrees")
+NORMALIZER = "policy_preprocessor_step_3_normalizer_processor.safetensors"
+
+
+def config(**changes):
+    """Change the policy's config.json."""
+    return lambda folder: edit(folder / "config.json", lambda text: json.dumps(json.loads(text) | changes))
+
+
+def edit(path, change):
+    path.write_text(change(path.read_text()))
+
+
+def without(*names):
+    """Leave statistics out."""
+
+    def damage(folder):
+        arrays = load_file(folder / NORMALIZER)
+        save_file({name: one for name, one in arrays.items() if name not in names}, folder / NORMALIZER)
+
+    return damage
+
+
+def without_state(folder):
+    """As of a normaliser that was never given statistics."""
+
+    def change(text):
+        steps = json.loads(text)
+        steps["steps"][3].pop("state_file")
+        return json.dumps(steps)
+
+    edit(folder / "policy_preprocessor.json", change)
+
+
+DAMAGES = {
+    "no processors": lambda folder: (folder / "policy_preprocessor.json").unlink(),
+    "unknown step": lambda folder: edit(
+        folder / "policy_preprocessor.json", lambda text: text.replace("to_batch_processor", "delta_action_processor")
+    ),
+    "no file of statistics": lambda folder: (folder / NORMALIZER).unlink(),
+    "no statistics": without_state,
+    "no mean": without(f"{STATE}.mean"),
+    "none of an input": without(*(f"{STATE}.{one}" for one in ("mean", "std", "min", "max"))),
+    "another version": config(attention_of_tomorrow=True),
+    "another size": config(dim_model=64),
+    "chunk of zero": config(chunk_size=0, n_action_steps=0),
+    "no weights": lambda folder: (folder / "model.safetensors").unlink(),
+    "cut weights": lambda folder: (folder / "model.safetensors").write_bytes(b"\x10\0\0"),
+    "no steps": lambda folder: (folder / "policy_preprocessor.json").write_text("{}"),
+}
+CHUNKS = ("size=5", "steps=9", "ensemble=much", "stpes=4", "overlap=4")
+
+
+def said(folder, *flags):
+    errors = io.StringIO()
+    with contextlib.redirect_stderr(errors), contextlib.suppress(SystemExit):
+        main([f"lerobot:{folder}", "--data", str(made / "data"), "--out", str(copies / "a.zip"), *FLAGS, *flags])
+    return errors.getvalue().replace(str(folder), "FOLDER").splitlines()[-2:]
+
+
+found = {}
+for name, damage in DAMAGES.items():
+    copy = copies / name.replace(" ", "-")
+    shutil.copytree(made / "pretrained_model", copy)
+    damage(copy)
+    found[name] = said(copy)
+for option in CHUNKS:
+    found[option] = said(made / "pretrained_model", "--chunk", option)
+print(json.dumps(found))
