@@ -20,6 +20,8 @@ FADE = 8
 LEFT, KNOWN = "chunk.left", "chunk.known"
 """Inputs of a policy with an `overlap`: what is left of the chunk before for the next steps, filled up with zeros,
 (size, ...); and for how many steps, and how many of these pass until a new one comes, (2,)."""
+TOO_SLOW = "The policy is too slow for this computer: end other programs, or compute its chunks on a policy server"
+"""What to say of a late chunk that is computed here."""
 STEEPEST = 1.5
 """Greatest slope of 3 w^2 - 2 w^3, by which a change-over fades."""
 
@@ -53,7 +55,7 @@ class Plan:
         chunk: Chunk | None,
         shape: tuple[int, ...],
         fade: Array | None = None,
-        slow: str = "The policy is too slow for this computer",
+        slow: str = TOO_SLOW,
     ) -> None:
         if chunk is None:
             raise PolicyError(f"the policy: {ONE_BY_ONE}")

@@ -18,6 +18,7 @@ import onnxruntime
 from onnxruntime.capi import onnxruntime_pybind11_state as faults
 
 from bam_train.errors import PolicyError
+from bam_train.policy.chunks import TOO_SLOW
 
 MOST_SECONDS = 5.0
 """Most CPU time of this process for loading a graph, and for its first run [s]."""
@@ -73,7 +74,7 @@ class OnnxSession:
         slow: What to say of a late chunk.
     """
 
-    slow = "The policy is too slow for this computer"
+    slow = TOO_SLOW
 
     def __init__(self, onnx: bytes, threads: int = 1) -> None:
         try:

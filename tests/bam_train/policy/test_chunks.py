@@ -220,7 +220,7 @@ def test_actions_end_with_their_chunk(slow):
     policy.let.release()
     beside.prepare(np.array([1.0]))
     assert acts(beside, *range(1, 7)) == [10.0, 11.0, 12.0, 13.0, 14.0, 15.0]
-    with pytest.raises(PolicyError, match="The policy is too slow for this computer"):
+    with pytest.raises(PolicyError, match="The policy is too slow for this computer: end other programs, or compute"):
         acts(beside, 7)
 
 
