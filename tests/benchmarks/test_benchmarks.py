@@ -34,6 +34,7 @@ def bench(run):
         assert status in (0, 1), err
         head, *lines = out.splitlines()
         assert re.match(rf"{arguments[0]}: \d+ cores, load ", head)
+        assert lines, err
         return [re.split(r"   +", line) for line in lines if line.split() != ["figure", "measured", "goal"]]
 
     return rows
