@@ -81,10 +81,17 @@ def _zip(config: ExportConfig, path: Path) -> Exported:
 
     require_plain_sb3(path)
     if not config.trust_pickle or config.env is None or config.algo is None:
-        text = "stable-baselines3 reads it, and runs whatever code is in it. If you trust its maker, give"
-        raise SettingsError(f"{path}: {text} --trust-pickle, and say what it is: --env ID --algo NAME")
+        flags = {"--trust-pickle": config.trust_pickle, "--env ID": config.env, "--algo NAME": config.algo}
+        missing = " ".join(flag for flag, given in flags.items() if not given)
+        text = "stable-baselines3 reads it, and runs whatever code is in it, which does not say what it is. If you"
+        raise SettingsError(f"{path}: {text} trust its maker, give {missing}")
     env, kwargs = resolve_id(config.env), read_env_kwargs(config.set)
     say(f"bam-export: warning: reading {path} runs whatever code is in it (--trust-pickle)")
+    if config.statistics is None:
+        say(
+            "bam-export: warning: if its run normalised observations, the policy acts wrongly without the statistics "
+            "that VecNormalize saved; give them with --statistics"
+        )
     return export_trusted(path, config.algo.lower(), env, kwargs, config.statistics)
 
 

@@ -202,8 +202,8 @@ class DeployReport:
             return faults
         return [
             *faults,
-            f"{missed} of {planned} ticks were missed: policy and robot take longer than the {1e3 * period:g} ms that "
-            "the policy was made for; use a faster computer, or stop what else runs on it",
+            f"{missed} of {planned} deadlines were missed: policy and robot take longer than the {1e3 * period:g} ms "
+            "that the policy was made for; use a faster computer, or stop what else runs on it",
         ]
 
     def lines(self) -> list[str]:

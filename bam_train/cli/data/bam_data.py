@@ -59,8 +59,8 @@ def collect(config: flags.CollectConfig) -> None:
     except KeyboardInterrupt as stop:
         seed = config.seed + max(config.episodes, config.num_envs or 0)  # which no environment had
         text = (
-            f"interrupted. Kept in {config.place}: {counted(kept, 'whole episode')} of {config.episodes}; for the "
-            f"others, run it again with --episodes {config.episodes - kept} --seed {seed}"
+            f"interrupted. Kept in {config.place}: {counted(kept, 'whole episode')} of {config.episodes}, those "
+            f"that ended first; for the others, run it again with --episodes {config.episodes - kept} --seed {seed}"
         )
         if isinstance(stop, Terminated):
             say(f"bam-data: {text}")

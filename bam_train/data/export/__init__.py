@@ -14,6 +14,7 @@ mcap      file .mcap                        Foxglove, ``bam-replay``; the topics
 
 from __future__ import annotations
 
+import errno
 import os
 import pkgutil
 import shutil
@@ -30,6 +31,11 @@ _HDF5 = (".h5", ".hdf5")
 FORMATS = {"minari": (), "d3rlpy": _HDF5, "lerobot": (), "rllib": (), "hdf5": _HDF5, "mcap": (".mcap",)}
 """How the name of a file of each may end; () where it is a folder. ``write`` of its module ``to_...`` takes a data set,
 indices of episodes and a path to write, and returns how to open what was written."""
+
+_CRASHING = ("minari", "d3rlpy", "hdf5")
+"""Formats of HDF5, whose library ends the process where the disk is full."""
+_EPISODE_BYTES = 50_000
+"""What HDF5 needs for an episode besides its numbers, at most."""
 
 
 def export(data: DataSet, kind: str, out: Path, indices: Sequence[int] | None = None) -> str:
@@ -52,8 +58,22 @@ def export(data: DataSet, kind: str, out: Path, indices: Sequence[int] | None = 
         raise SettingsError(f"{data.place}: there is no episode to export; record some first")
     write: Callable[[DataSet, Sequence[int], Path], str] = pkgutil.resolve_name(f"{__name__}.to_{kind}:write")
     with _new(out.expanduser(), is_folder=not FORMATS[kind]) as path:
+        if kind in _CRASHING:
+            _require_room(data, chosen, path.parent)
         opened = write(data, chosen, path)
     return opened.replace(str(path), str(out))
+
+
+def _require_room(data: DataSet, chosen: Sequence[int], folder: Path) -> None:
+    """Raise OSError if the disk may have too little room for these episodes, as long steps as those of the first."""
+    episode = next(iter(data.episodes(chosen[:1])))
+    seen = [leaf.of(episode.observations) for leaf in data.info.observation_leaves] * 2  # and the next ones
+    done = [leaf.of(episode.actions) for leaf in data.info.action_leaves]
+    step = sum(one.nbytes for one in (*seen, *done, *episode.columns.values())) / len(episode) + 16
+    steps = sum(data.facts(index)["length"] for index in chosen)
+    needed, free = _EPISODE_BYTES * len(chosen) + step * steps, shutil.disk_usage(folder).free
+    if needed > free:
+        raise OSError(errno.ENOSPC, f"it may need {needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free")
 
 
 @contextmanager

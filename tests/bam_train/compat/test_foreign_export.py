@@ -280,6 +280,8 @@ def test_a_zip_of_stable_baselines3(run, tmp_path, capsys):
     capsys.readouterr()  # what importing it says
     status, said, err = run(main, path, "--env", "CartPole-v1", "--algo", "ppo", "--trust-pickle", "--out", out)
     warning = f"bam-export: warning: reading {path} runs whatever code is in it (--trust-pickle)\n"
+    normalised = "if its run normalised observations, the policy acts wrongly without the statistics that VecNormalize"
+    warning += f"bam-export: warning: {normalised} saved; give them with --statistics\n"
     assert (status, err) == (0, warning)
     assert said.splitlines()[0] == f"{out}: ppo on CartPole-v1, out of {path}"
     policy, seen = FrozenPolicy.load(out), np.array([0.1, -0.2, 0.05, 0.3], np.float32)
@@ -287,8 +289,8 @@ def test_a_zip_of_stable_baselines3(run, tmp_path, capsys):
     status, _, err = run(main, path, "--env", "CartPole-v1", "--algo", "ppo")
     assert (status, err) == (
         1,
-        f"bam-export: {path}: stable-baselines3 reads it, and runs whatever code is in it. If you trust its maker, "
-        "give --trust-pickle, and say what it is: --env ID --algo NAME\n",
+        f"bam-export: {path}: stable-baselines3 reads it, and runs whatever code is in it, which does not say what it "
+        "is. If you trust its maker, give --trust-pickle\n",
     )
     gone = tmp_path / "gone.zip"
     assert run(main, f"sb3:{gone}", "--env", "CartPole-v1", "--algo", "ppo", "--trust-pickle") == (

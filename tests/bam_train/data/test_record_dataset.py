@@ -220,8 +220,8 @@ def test_collecting_that_is_interrupted_keeps_whole_episodes_and_says_how_to_go_
     data = DataSet.open("data")
     assert [row.get("end") for row in map(data.facts, range(len(data)))] == [None] * len(data)
     text = (
-        f"interrupted. Kept in data: {len(data)} whole episodes of 10; for the others, run it again with "
-        f"--episodes {10 - len(data)} --seed 15\n"
+        f"interrupted. Kept in data: {len(data)} whole episodes of 10, those that ended first; for the others, "
+        f"run it again with --episodes {10 - len(data)} --seed 15\n"
     )
     said = (
         f"bam-data collect: {text}"

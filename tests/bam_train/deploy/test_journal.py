@@ -58,7 +58,7 @@ def test_everything_is_in_the_report(corridor_checkpoint):
     assert (values["episodes"], values["successes"], values["ticks"], values["missed_ticks"]) == (2, 1, 4, 2)
     assert values["target_rate_hz"] == 20
     assert values["warnings"] == [
-        "2 of 6 ticks were missed: policy and robot take longer than the 50 ms that the policy was made for; use a "
+        "2 of 6 deadlines were missed: policy and robot take longer than the 50 ms that the policy was made for; use a "
         "faster computer, or stop what else runs on it"
     ]
     assert values["lateness_ms"] == {"p50": 1.0, "p99": 117.4, "max": 121.0}

@@ -1,6 +1,7 @@
 """The libraries themselves read the numbers of every episode, with its first and last observation."""
 
 import json
+import shutil
 from pathlib import Path
 
 import gymnasium as gym
@@ -167,6 +168,17 @@ def test_lerobot_is_a_data_set_of_few_files(tmp_path):
     found = DataSet.open(tmp_path / "out")
     assert found.digests == [data.digests[4], data.digests[1]]
     assert len(list((tmp_path / "out").rglob("file-*.parquet"))) == 2
+
+
+@pytest.mark.parametrize(("kind", "name"), [("minari", "out"), ("d3rlpy", "out.h5"), ("hdf5", "out.h5")])
+def test_a_disk_that_may_fill_up_is_named_before_hdf5_crashes(kind, name, tmp_path, monkeypatch):
+    data, usage = record(tmp_path / "data"), type(shutil.disk_usage(tmp_path))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**9, 10**9 - 10**5, 10**5))
+    with pytest.raises(OutputError) as error:
+        export(data, kind, tmp_path / name)
+    why = "cannot be written: it may need 0.3 MB, and 0.1 MB are free"
+    assert str(error.value) == f"{tmp_path / name}: {why}; choose another place"
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
 def test_what_cannot_be_exported_is_one_line(tmp_path):
