@@ -491,6 +491,7 @@ class Resident:
             self._report(_REPORT_PERIOD)
             return
         self._was_connected = True
+        self._logged = {title: ("", at) for title, (_, at) in self._logged.items()}  # what comes again is said again
         self._admit = lambda env, lines: None  # the operator is asked once
         self.session.deployment.swap(self.succession.policy())
         self.succession.load_previous()
