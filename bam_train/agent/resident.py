@@ -15,7 +15,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -491,6 +491,7 @@ class Resident:
             self._report(_REPORT_PERIOD)
             return
         self._was_connected = True
+        self._logged = {title: ("", at) for title, (_, at) in self._logged.items()}  # what comes again is said again
         self._admit = lambda env, lines: None  # the operator is asked once
         self.session.deployment.swap(self.succession.policy())
         self.succession.load_previous()
@@ -731,19 +732,16 @@ class Resident:
 
     def _warnings(self) -> list[str]:
         """What the operator should know: of the guards, the ticks, the recording and the audit file."""
-        session = self.session
-        found = [*self._motion_warnings()]
-        found += [f"recording: {session.recording_fault}"] if session is not None and session.recording_fault else []
-        return [*found, *([f"audit: {self.audit.fault}"] if self.audit.fault else [])]
+        files = {"recording": self.session and self.session.recording_fault, "audit": self.audit.fault}
+        found = {**self._motion_warnings(), **{title: fault for title, fault in files.items() if fault}}
+        return [f"{title}: {text}" for title, text in found.items()]
 
-    def _motion_warnings(self) -> Iterator[str]:
-        """Those of the guards, and of late ticks."""
+    def _motion_warnings(self) -> dict[str, str]:
+        """Those of the guards, and of late ticks, by title."""
         if self.session is None:
-            return
+            return {}
         warnings, late = self.session.deployment.journal.warnings, self.session.deployment.times.warning
-        yield from (f"{title}: {text}" for title, text in warnings.items())
-        if late and LATE not in warnings:
-            yield f"late ticks: {late}"
+        return warnings if LATE in warnings or not late else {**warnings, "late ticks": late}
 
     def _report(self, least: float = 0.0) -> None:
         """Send the status, and transitions, unless the last ones are younger than `least` [s]."""
@@ -751,8 +749,8 @@ class Resident:
         if now - self._reported >= least:
             self._reported = now
             self.send(Report(self.status()))
-            for warning in self._motion_warnings():  # recorder and audit file log theirs
-                self._log_anew(warning.partition(": ")[0], f"warning: {warning}")
+            for title, text in self._motion_warnings().items():  # recorder and audit file log theirs
+                self._log_anew(title, f"warning: {title}: {text}")
             if self.transitions.wanted and (rows := self.transitions.take()) is not None:
                 self.send(Rows(encode(rows)))
 

@@ -233,24 +233,22 @@ class Succession:
         """Let `version` act as the request says, and wait until it does."""
         resident, arguments = self._resident, ask.arguments
         choice = self._made(version, ask, session)
-        if arguments.get("wait") and choice.trials is not None and not session.says_success:
+        waits = arguments.get("wait") and choice.trials is not None
+        if waits and not session.says_success:
             raise RequestRefused(
                 f"{session.env_id} reports no success, so that no trial here decides: do the trials with bam-deploy "
                 "--stage trial, then push with --stage full"
             )
-        when = "tick" if choice.at_once else "episode"
-        news = f"it acts from the next {when} on"
-        if resident.state is State.TAKEN_OVER:
-            news = self._rests(State.TAKEN_OVER, "It acts")
+        taken, when = resident.state is State.TAKEN_OVER, "tick" if choice.at_once else "episode"
+        news = self._rests(State.TAKEN_OVER, "It acts") if taken else f"it acts from the next {when} on"
         resident.send(RequestProgress(ask.number, f"accepted; {news}"))
         resident.choose(choice)
         if not choice.active.wait(_EPISODE_TIMEOUT):
             raise RequestRefused(f"{version.digest[:12]} was accepted, and did not become active in an hour")
-        if arguments.get("wait") and choice.trials is not None:
-            news = "acts as the candidate; its trials decide"
-            if not (state := resident.state).drives:
-                news = f"is the candidate; {self._rests(state, 'Its trials begin')}"
-            resident.send(RequestProgress(ask.number, news))
+        if waits:
+            state, news = resident.state, "acts as the candidate; its trials decide"
+            rests = "" if state.drives else f"is the candidate; {self._rests(state, 'Its trials begin')}"
+            resident.send(RequestProgress(ask.number, rests or news))
             self._wait_for_outcome(choice, ask.number)
         status = resident.status()
         return {
@@ -279,10 +277,8 @@ class Succession:
 
     def _rests(self, state: State, what: str) -> str:
         """Why, and since when, the policy does not drive in this `state`, and what ends it: then, `what` happens."""
-        resident = self._resident
-        since = time.strftime("%H:%M:%S", time.localtime(resident.since))
-        text = f"the agent is {state.value} since {since}: {resident.why.rstrip('.')}"
-        return f"{text}. {what} once {_ONCE[state]}"
+        since, why = time.localtime(self._resident.since), self._resident.why.rstrip(".")
+        return f"the agent is {state.value} since {time.strftime('%H:%M:%S', since)}: {why}. {what} once {_ONCE[state]}"
 
     def _made(self, version: Version, ask: Ask, session: RobotSession) -> Choice:
         resident, digest = self._resident, version.digest

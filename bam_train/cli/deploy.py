@@ -120,8 +120,8 @@ def _run(
             say(f"bam-deploy: {ending.reason}")
         where = place.text or "simulated here"
         facts: Any = {"guards": guards_of(env), "trials": deployment.trials, "recorder": deployment.recorder}
-        facts |= {"shadow": admission.shadow, "identity": admission.identity, "uncounted": deployment.uncounted}
-        facts["agent_guards"] = getattr(robot_of(env), "agent_guards", {})
+        facts |= {"shadow": admission.shadow, "identity": admission.identity}
+        facts |= {"agent_guards": getattr(robot_of(env), "agent_guards", {})}
         report = DeployReport(checkpoint, seed, ending, journal, pacer, where, **facts)
         for warning in (one for one in report.warnings() if not watcher.has_written(one)):
             say(f"bam-deploy: warning: {warning}")

@@ -44,12 +44,11 @@ class Agreement:
     def text(self) -> str:
         """One line: ``agreement with whoever drives: 0.83 (0.79 to 0.87) in 412 moving ticks``."""
         if self.mean is None and self.ticks:
-            moving = counted(self.ticks, "tick")
-            return f"agreement with whoever drives: nobody drove; the policy would have moved in {moving}"
+            seen = f"nobody drove; the policy would have moved in {counted(self.ticks, 'tick')}"
+            return f"agreement with whoever drives: {seen}"
         if self.mean is None:
-            return (
-                f"agreement with whoever drives: nobody moved, nor would the policy, in {counted(self.still, 'tick')}"
-            )
+            seen = f"nobody moved, nor would the policy, in {counted(self.still, 'tick')}"
+            return f"agreement with whoever drives: {seen}"
         between = "too short for an interval"
         if self.interval is not None:
             between = f"{self.interval[0]:.2f} to {self.interval[1]:.2f}"

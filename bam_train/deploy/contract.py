@@ -102,7 +102,7 @@ class Contract:
             return f"{theirs}: give the address of {own}, or a policy for {info.name}"
         if first.passes and info.simulated:
             return "the computer that simulates the robot is slow or busy: end other programs there, and run it again"
-        if info.agent:
+        if info.agent and not first.passes:
             return "give a policy for the environment of the live agent there"
         return f"start the robot with {self.stand_in}" if info.simulated and self.stand_in else "correct the robot"
 

@@ -111,8 +111,6 @@ class Deployment:
         )
         self.judge: Callable[[EpisodeRecord], bool | None] = lambda record: None
         """Called after a trial whose environment reports no success; whether it succeeded, None if nobody says."""
-        self.uncounted = ""
-        """Why the last trial does not count, in one line; "" if it does, or if a person ended it."""
         self._closing = self._closed = False
         self._flight = FlightLog(recorder, env, journal)
         self._loop.observers += [*observers, _Comparison(env, self._loop, journal), self._flight.record]
@@ -182,8 +180,8 @@ class Deployment:
             self.journal.judged(record, success)
             if self.recorder is not None:
                 self.recorder.event(f"the operator says: {'a success' if success else 'no success'}")
-        self.uncounted = "nobody said whether it succeeded" if record.success is None else ""
-        trials.end(record.success is True, self.uncounted or record.end, void=record.success is None)
+        void = record.success is None
+        trials.end(record.success is True, "nobody said whether it succeeded" if void else record.end, void=void)
 
     def _begins(self, seed: int) -> None:
         if self.trials is not None:
@@ -254,8 +252,7 @@ class Deployment:
                 self._halt()
             raise
         ending = _unless_it_fails(ending, "closing", self._close)
-        if self.trials is not None and self.trials.is_running:  # of an episode that was cut short
-            self.uncounted = excuse
+        if self.trials is not None:  # of an episode that was cut short
             ended = partial(self.trials.end, False, excuse or ending.reason, void=by_person or excuse != "")
             ending = _unless_it_fails(ending, "recording the trial", ended)
         return _unless_it_fails(ending, "recording", self._flush)  # of an episode that was cut short

@@ -149,8 +149,6 @@ class DeployReport:
     """Counts of the guards of a live robot, by name; see `SafeRobot.report`."""
     trials: Trials | None = None
     """The trials of this deployment."""
-    uncounted: str = ""
-    """Why the last trial does not count; see `Deployment.uncounted`."""
     agent_guards: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """The same of the live agent that drives the robot otherwise, without limits; see `TakeOver.guards`."""
     shadow: Shadow | None = None
@@ -182,7 +180,7 @@ class DeployReport:
             "identity": self.identity,
             "marks": list(journal.marks),
             "trials": None if self.trials is None else self.trials.evidence.to_json(),
-            "uncounted": self.uncounted,
+            "uncounted": "" if self.trials is None else self.trials.uncounted,
             "shadow": None if self.shadow is None else self.shadow.agreement.to_json(),
             "guards": finite_limits(self.guards),
             "agent_guards": finite_limits(self.agent_guards),
@@ -217,7 +215,7 @@ class DeployReport:
             *([f"lateness {lateness_text(self.pacer)}"] if self.pacer.period is not None else []),
             *([guards_text(self.guards, self.pacer.ticks)] if self.guards else []),
             *([f"live agent: {guards_text(self.agent_guards, self.pacer.ticks)}"] if self.agent_guards else []),
-            *([f"the last trial does not count: {self.uncounted}"] if self.uncounted else []),
+            *([f"the last trial does not count: {one.uncounted}" for one in (self.trials,) if one and one.uncounted]),
             *([self.trials.evidence.text] if self.trials else []),
             *([self.shadow.agreement.text] if self.shadow else []),
             *([recorded_text(self.recorder)] if self.recorder is not None else []),
@@ -252,13 +250,10 @@ def guards_text(guards: Mapping[str, Mapping[str, Any]], ticks: int) -> str:
 
     On the way to a start pose there are no ticks.
     """
+    of = counted(ticks, "tick")
 
     def count(times: int) -> str:
-        return (
-            f"in {times} of {counted(ticks, 'tick')} ({100 * times / ticks:.1f} %)"
-            if times <= ticks
-            else f"{times} times"
-        )
+        return f"in {times} of {of} ({100 * times / ticks:.1f} %)" if times <= ticks else f"{times} times"
 
     counts = {
         what: ", ".join(f"{name} ({row['number']}) {count(row[what])}" for name, row in guards.items() if row.get(what))

@@ -322,16 +322,13 @@ class Trials:
     def __init__(self, record: TrialRecord, subject: Subject, threshold: float, facts: Mapping[str, Any]) -> None:
         self.record, self.subject, self.threshold, self.facts = record, subject, threshold, dict(facts)
         self._running: str | None = None
+        self.uncounted = ""
+        """Why the last trial does not count, in one line; "" if it does."""
 
     @property
     def evidence(self) -> Evidence:
         """The evidence of all trials so far, including earlier deployments; raises FormatError."""
         return self.record.evidence(self.subject, self.threshold)
-
-    @property
-    def is_running(self) -> bool:
-        """Whether a trial has begun and not ended."""
-        return self._running is not None
 
     def next_seed(self, first: int) -> int:
         """The least seed from `first` on that no trial had so far, nor any after it; raises FormatError."""
@@ -344,7 +341,7 @@ class Trials:
     def end(self, success: bool, reason: str, *, void: bool = False) -> None:
         """Record the end of the running trial, if there is one; a `void` one does not count."""
         if self._running is not None:
-            running, self._running = self._running, None
+            running, self._running, self.uncounted = self._running, None, reason if void else ""
             self.record.end(running, success, reason, void=void)
 
 

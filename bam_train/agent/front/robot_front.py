@@ -16,7 +16,6 @@ import numpy as np
 
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotInCommand, ProtocolError, RemoteError, SafetyStop
 from bam_envs.live.camera import LiveCamera
-from bam_envs.live.take_over import COUNTED
 from bam_envs.remote.serve.robot_service import RobotService
 from bam_envs.ros.codec import AGENT_STEP_TOPIC, AGENT_TOPIC, HALT_TOPIC, RobotInfo
 from bam_envs.rosbridge.bus import Caller
@@ -52,6 +51,17 @@ _KINDS = ("CandidateRefused", "TrialsNeeded", "UnknownVersion")  # of refusals t
 _ANSWER_TIMEOUT = 10.0  # longest wait for an answer of the resident, unless it needs longer [s]
 
 
+def guards_since(before: Fields, now: Fields) -> dict[str, dict[str, Any]]:
+    """What each guard that acted counted since `before`, without limits; all if its robot was connected anew."""
+    acted, zero = dict[str, dict[str, Any]](), {"altered": 0, "held": 0, "stopped": 0}
+    for name, row in now.items():
+        new = {what: row[what] - before.get(name, zero)[what] for what in zero}
+        new = new if min(new.values()) >= 0 else {what: row[what] for what in zero}
+        if any(new.values()):
+            acted[name] = {"number": row["number"], **new}
+    return acted
+
+
 class FrontProcess:
     """The port of a live agent, and the hub of its agent socket.
 
@@ -76,6 +86,7 @@ class FrontProcess:
         self._numbers = itertools.count(1)
         self._driver: str | None = None  # the last owner of the lease
         self._episode = 0  # of people
+        self._counts: dict[str, Any] = {}  # those of the guards when a program took over
         self._ended_at = -_HALT_LATE  # of the last lease [s]
         self._handing: dict[str, bool | None] = {}  # clients that hand back -> whether the policy goes on
         self.sent: list[float] | None = None
@@ -237,19 +248,16 @@ class FrontProcess:
             refusal = None if owner is None else self.lease.refusal()
             return {"owner": owner, "refusal": refusal, "state": self._report["state"]}
         if do == "take":
+            drives = self.lease.holder == caller.client
             self.take_over(caller, who, who)
+            self._counts = self._counts if drives else self._report.get("guards", {})
             self._episode += 1
-            return {**self._told(), "learner": self.listens(EVENT)}
+            return {"state": self._report["state"], "learner": self.listens(EVENT)}
         if do == "hand_back":
             self.hand_back(caller.client, who, caller.address)
-            return self._told()
+            acted = guards_since(self._counts, self._report.get("guards", {}))
+            return {"state": self._report["state"], "guards": acted}
         raise RemoteError(f"{AGENT_TOPIC}: expected look, take or hand_back, found {do!r:.40}.")
-
-    def _told(self) -> Fields:
-        """The agent's state, and the counts of its guards, without limits: JSON has no infinite ones."""
-        guards = self._report.get("guards", {})
-        counts = {name: {what: row[what] for what in ("number", *COUNTED)} for name, row in guards.items()}
-        return {"state": self._report["state"], "guards": counts}
 
     def take_over(self, caller: Caller, who: str, shown: str, *, force: bool = False) -> None:
         """Give `caller` the lease; other clients see the name `shown`."""

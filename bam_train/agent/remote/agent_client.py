@@ -107,17 +107,13 @@ class AgentClient:
         try:
             self._thread.start(self._main)
         except NoServer as error:
-            if str(error).endswith(_NO_AGENT) and (other := self._other()):
-                raise NoServer(self.url, other) from error
-            raise
+            if not str(error).endswith(_NO_AGENT):
+                raise
+            from bam_envs.live.bringup import what_answers_at
+
+            endpoint = replace(self._endpoint, connect_timeout=min(self.timeout, _RECOGNITION_TIMEOUT))
+            raise NoServer(self.url, what_answers_at(endpoint, "live agent") or _NO_AGENT) from error
         return self
-
-    def _other(self) -> str:
-        """What answers at the address instead of an agent, if it tells."""
-        from bam_envs.live.bringup import what_answers_at
-
-        endpoint = replace(self._endpoint, connect_timeout=min(self.timeout, _RECOGNITION_TIMEOUT))
-        return what_answers_at(endpoint, "live agent")
 
     def close(self) -> None:
         """Close the connection. Idempotent."""

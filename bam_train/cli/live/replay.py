@@ -162,9 +162,8 @@ def lines_of(recording: Recording) -> list[str]:
         if row["end"] == "stopped" and not row["success"]:
             how = "stopped" if recording.complete or number < len(episodes) else "cut off"
         seed = "" if row["seed"] is None else f" (seed {row['seed']})"
-        lines.append(
-            f"episode {number}{seed}: {how} after {counted(row['length'], 'step')}, return {row['return']:.2f}"
-        )
+        how += f" after {counted(row['length'], 'step')}"
+        lines.append(f"episode {number}{seed}: {how}, return {row['return']:.2f}")
     acted = [f"{guard} in {counted(count, 'tick')}" for guard, count in facts["guards"].items()]
     lines.append(f"guard that acted last: {', '.join(acted)}" if acted else "no guard acted")
     for stage, row in facts["latency_ms"].items():

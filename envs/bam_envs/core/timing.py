@@ -156,13 +156,8 @@ class Pacer:
 
 
 def least_lateness(period: float) -> float:
-    """The delay from which on a tick counts as late, for a `period` [s]."""
+    """The delay [s] above which a tick is late, and shows that the computer was busy; `period` is in s."""
     return max(_LATE_BY * period, _JITTER)
-
-
-def is_disturbed(late: float, period: float) -> bool:
-    """Whether a tick that began `late` [s] after its deadline shows that the computer was busy; `period` is in s."""
-    return late > least_lateness(period)
 
 
 class TickTimes:
@@ -180,7 +175,7 @@ class TickTimes:
         self.period = period
         self.late = self.slow = 0
         """Ticks that missed a deadline, and how many of these the policy made late."""
-        self._missed: deque[bool] = deque(maxlen=WINDOW)  # whether each of the last ticks missed a deadline
+        self._last: deque[tuple[bool, bool]] = deque(maxlen=WINDOW)  # whether each was late, and its policy made it so
         self._disturbed: deque[bool] = deque(maxlen=RECENT)
         self._computed: deque[float] = deque(maxlen=RECENT)
 
@@ -193,25 +188,26 @@ class TickTimes:
             acted: Duration of the action before it [s].
             computed: CPU time of that action [s].
         """
-        self.late += missed > 0
-        self._missed.append(missed > 0)
         if self.period is None:
             return False
         self._computed.append(computed)
         is_policy = late <= acted and computed >= SLOW * self.period
-        self._disturbed.append(is_disturbed(late, self.period) and not is_policy)
-        self.slow += (is_slow := missed > 0 and is_policy)
+        self._disturbed.append(late > least_lateness(self.period) and not is_policy)
+        is_late, is_slow = missed > 0, missed > 0 and is_policy
+        self._last.append((is_late, is_slow))
+        self.late, self.slow = self.late + is_late, self.slow + is_slow
         return is_slow
 
     @property
     def warning(self) -> str:
         """That more of the last ticks were late than may be of those of a trial; "" if not."""
-        late, seen = sum(self._missed), len(self._missed)
-        if seen < WINDOW or late <= BUSY * seen:
+        late, slow = map(sum, zip(*self._last or [(False, False)], strict=True))
+        if len(self._last) < WINDOW or late <= BUSY * WINDOW:
             return ""
-        late_ones = f"{late} of the last {seen} ticks missed their deadline"
-        so_far = f"{self.late} so far, {self.slow} of them because of the policy"
-        return f"{late_ones} ({so_far}): {'use a faster policy' if 2 * self.slow > self.late else 'end other programs'}"
+        remedy = "use a faster policy" if 2 * slow > late else "end other programs"
+        return (
+            f"{late} of the last {WINDOW} ticks missed their deadline, {slow} of them because of the policy: {remedy}"
+        )
 
     @property
     def computed(self) -> float:

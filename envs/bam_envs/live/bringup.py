@@ -9,7 +9,7 @@ Longer than most files: all that a client learns of a server before it may move 
 import math
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import closing, suppress
 from functools import partial
 from typing import Any
@@ -17,12 +17,12 @@ from typing import Any
 from bam_envs.arms.description import ArmDescription
 from bam_envs.core.errors import BamEnvsError, LinkLost, NotReady, ProtocolError, RemoteError, StaleState
 from bam_envs.core.robot import RobotSpec
-from bam_envs.core.robot_models import known_models, read_description
+from bam_envs.core.robot_models import find_model, known_models
 from bam_envs.core.timing import Deadline
 from bam_envs.live.state import LiveState, Mailbox
 from bam_envs.ros.codec import INFO_SERVICE, RobotInfo, has_room, not_wanted, read_info
 from bam_envs.ros.freshness import Tagger, read_tag
-from bam_envs.ros.messages import bare_type, same_type, tag_text
+from bam_envs.ros.messages import bare_type, names_of, same_type, tag_text
 from bam_envs.ros.profile_tables import Enable, Readiness, RobotProfile, Sink
 from bam_envs.rosbridge.bus import Caller, Message, namespaces_with
 from bam_envs.rosbridge.client import RosbridgeLink
@@ -418,15 +418,12 @@ def another_robot(link: RosBus, spec: RobotSpec) -> str:
 
     It is known by the names of its joints.
     """
-    ours = _joints(spec.command.labels, spec.command.units)
-    there = set(_measured_joints(link)) if ours else set()
-    if not there or set(ours) <= there:
+    ours = [label for label, unit in zip(spec.command.labels, spec.command.units, strict=True) if unit == "rad"]
+    if not ours or set(ours) <= (there := _measured_joints(link)):
         return ""
-    arms = (read_description(path) for path in known_models(ArmDescription).values())
-    found = {arm.name: arm.joint_names for arm in arms if isinstance(arm, ArmDescription)}
-    fits = {name: joints for name, joints in found.items() if set(joints) <= there}
-    most = max(map(len, fits.values()), default=0)
-    names = sorted(name for name, joints in fits.items() if len(joints) == most)
+    arms = {name: find_model(name, ArmDescription).joint_names for name in known_models(ArmDescription)}
+    fits = {name: joints for name, joints in sorted(arms.items()) if set(joints) <= there}
+    names = [name for name, joints in fits.items() if len(joints) == max(map(len, fits.values()))]
     if not names:
         return ""
     return (
@@ -435,23 +432,17 @@ def another_robot(link: RosBus, spec: RobotSpec) -> str:
     )
 
 
-def _joints(labels: tuple[str, ...], units: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(label for label, unit in zip(labels, units, strict=True) if unit == "rad")
-
-
-def _measured_joints(link: RosBus) -> Iterator[str]:
+def _measured_joints(link: RosBus) -> set[str]:
     """The joints in the next messages of joint states in the namespace of a link, whatever their topics."""
     with suppress(BamEnvsError):  # a server without rosapi
-        answer = link.call("/rosapi/topics", "rosapi/Topics", {}, _NAMED_WITHIN)
-        rows = zip(answer.get("topics") or (), answer.get("types") or (), strict=False)
-        topics = {str(topic) for topic, kind in rows if same_type(str(kind), _JOINT_STATES)}
+        answer, inbox = link.call("/rosapi/topics", "rosapi/Topics", {}, _NAMED_WITHIN), Mailbox(keeps_all=True)
+        rows = zip(map(str, answer.get("topics") or ()), map(str, answer.get("types") or ()), strict=False)
+        topics = {topic for topic, kind in rows if same_type(kind, _JOINT_STATES)}
         topics = {topic for topic in topics if topic.startswith(f"{link.namespace}/")}
-        inbox = Mailbox(keeps_all=True)
-        ends = [link.subscribe(topic, _JOINT_STATES, inbox.listener(topic)) for topic in sorted(topics)]
+        for topic in sorted(topics):
+            link.subscribe(topic, _JOINT_STATES, inbox.listener(topic))
         inbox.wait_for(lambda slots: topics <= slots.keys() or not link.is_up, _NAMED_WITHIN)
         inbox.wait_for(lambda slots: False, _OTHERS_WITHIN)
-        for end in ends:
-            end()
-        for message in (letter.message for topic in topics for letter in tuple(inbox.letters[topic])):
-            names = message.get("name") if isinstance(message, Mapping) else None
-            yield from map(str, names if isinstance(names, list) else ())
+        letters = [letter for topic in topics for letter in tuple(inbox.letters[topic])]
+        return {name for one in letters for name in names_of(one.message, "name", "joint states")}
+    return set()

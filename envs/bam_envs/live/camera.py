@@ -94,12 +94,11 @@ class LiveCamera:
             ProtocolError: It is not an image.
             MissingExtra: Pillow is not installed.
         """
-        letter = self._newest()
-        age, limit = self._age.at(self._clock()), self.source.max_age
+        image, age, limit = self._newest(), self._age.at(self._clock()), self.source.max_age
         if age > limit:
             what = f"{self._topic}: the newest image is {age:.3f} s old, and at most {limit:g} s are allowed."
             raise StaleState(what, age, limit)
-        return self._decode(letter)
+        return image
 
     def taken_at(self, stamp: float, timeout: float, ends: Callable[[], bool]) -> CameraImage:
         """The newest image, once one with this stamp or a later one has come: its age is that of the state.
@@ -115,18 +114,15 @@ class LiveCamera:
         while not self._mailbox.wait_for(came, self.source.max_age):
             if ends() or time.monotonic() > last:
                 raise StaleState(f"{self._topic}: no image of the newest state in {timeout:g} s. Does the camera run?")
-        return self._decode(self._newest())
+        return self._newest()
 
-    def _newest(self) -> Letter:
-        """The newest image, whose stamp is read."""
+    def _newest(self) -> CameraImage:
+        """The newest image, however old."""
         letter = None if self._link is None else self._mailbox.newest().get(_SLOT)
         if letter is None:
             raise ResetNeeded(f"The camera {self.source.name} at {self.url} is not connected. Call connect() first.")
         # Compared with the quickest image by their stamps: a link that hung delivers old images late.
         self._age.look(letter, self._topic, None)
-        return letter
-
-    def _decode(self, letter: Letter) -> CameraImage:
         if self._decoded is None or self._decoded.number != letter.number:
             pixels = decode_pixels(letter.message, self._topic)
             self._decoded = CameraImage(pixels, self._age.stamp, letter.number)

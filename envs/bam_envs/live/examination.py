@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bam_envs.core.errors import InvalidValue, LinkLost, ProtocolError
 from bam_envs.core.robot import RobotSpec
-from bam_envs.core.timing import BUSY, Deadline, Pacer, is_disturbed
+from bam_envs.core.timing import BUSY, Deadline, Pacer, least_lateness
 from bam_envs.live.bringup import TIMEOUT, TopicTypes, least_interval, robot_info, tagged_sinks
 from bam_envs.live.command_proof import CommandProof, needed_proof, robot_identity
 from bam_envs.live.state import Letter, Mailbox, SourceAge, concerns
@@ -296,7 +296,7 @@ def _measure(link: RosbridgeLink, inbox: Mailbox, period: float, seconds: float,
     pacer, enough = Pacer(period), Deadline(seconds)
     pacer.start()
     while link.is_up and not (enough.passed and (len(sent) >= _MIN_ECHOES or not pings)):
-        late.append(is_disturbed(pacer.wait(), period))
+        late.append(pacer.wait() > least_lateness(period))
         ticks.append(time.monotonic())
         if pings:
             ping = f"{name} {len(sent)}"

@@ -176,24 +176,23 @@ class RosbridgeRobot:
         halting = RosbridgeLink(self._endpoint, name="halt", lost_after=_LOST_AFTER)
         self._state.mailbox.clear()
         try:
-            self._open(control, halting)
-            self._begin(control)
+            try:
+                self._open(control, halting)
+                self._begin(control)
+            except (ProtocolError, StaleState) as error:
+                if other := bringup.another_robot(control, self.spec):
+                    raise ProtocolError(f"{self.url}: {other}") from error
+                raise
             for camera, _ in self._cameras.values():
                 camera.connect()
             self._control, self._halting = control, halting
-        except BaseException as error:
-            try:
-                if isinstance(error, ProtocolError | StaleState) and (
-                    other := bringup.another_robot(control, self.spec)
-                ):
-                    raise ProtocolError(f"{self.url}: {other}") from error
-                raise
-            finally:
-                for camera, _ in self._cameras.values():
-                    camera.close()
-                goals, self._goals = self._goals, None
-                for link in (halting, control, *([] if goals is None else [goals.link])):
-                    link.close()
+        except BaseException:
+            for camera, _ in self._cameras.values():
+                camera.close()
+            goals, self._goals = self._goals, None
+            for link in (halting, control, *([] if goals is None else [goals.link])):
+                link.close()
+            raise
         close_at_exit(self)
 
     def _control_link(self) -> RosBus:

@@ -7,7 +7,6 @@ lease, and pauses the policy; to hand back ends the lease, and the agent's setti
 import getpass
 import json
 import socket
-from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -20,8 +19,6 @@ from bam_envs.ros.freshness import Tagger
 from bam_envs.rosbridge.ros_bus import RosBus
 from bam_envs.rosbridge.string_rpc import StringRpc
 
-COUNTED = ("altered", "held", "stopped")
-"""What each guard counts."""
 _ANSWER = 3.0  # longest wait for an answer [s]
 
 
@@ -44,7 +41,6 @@ class TakeOver:
         self.guards: dict[str, dict[str, Any]] = {}
         """Number, and commands altered, ticks held and stops, of each guard of the agent that acted on this client's
         commands, by name; known once the robot was handed back."""
-        self._before: dict[str, Any] = {}  # those counts of the agent when this client took over
         self._is_watched = False  # whether a learner wants the steps
         self._step = 0
 
@@ -57,8 +53,6 @@ class TakeOver:
     def take(self) -> None:
         """Take over; the policy is paused. Raises `NotInCommand` if somebody else drives, or nobody can now."""
         answer = self._call("take")
-        if not self.taken:
-            self._before = _counts(answer)
         self.taken, self._step = True, 0
         self._is_watched = answer.get("learner") is True
         if self._is_watched:
@@ -91,28 +85,10 @@ class TakeOver:
         if self.taken and self._link.is_up:
             with suppress(BamEnvsError):
                 answer = self._call("hand_back")
-                state, self.guards = str(answer.get("state", "")), _since(self._before, _counts(answer))
+                state, self.guards = str(answer.get("state", "")), answer.get("guards", {})
         self.taken = False
         self._rpc.close()
         return state
 
     def _call(self, do: str) -> dict[str, Any]:
         return self._rpc.call({"do": do, "who": person()}, _ANSWER)
-
-
-def _counts(answer: Mapping[str, Any]) -> dict[str, Any]:
-    """The counts of an agent's guards in its answer; empty from an agent that does not tell them."""
-    guards = answer.get("guards")
-    return guards if isinstance(guards, dict) else {}
-
-
-def _since(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """What each guard that acted has counted since `before`; all of it if the agent has connected its robot anew."""
-    acted = dict[str, dict[str, Any]]()
-    for name, row in after.items():
-        earlier = before.get(name, {})
-        new = {what: row[what] - earlier.get(what, 0) for what in COUNTED}
-        new = new if min(new.values()) >= 0 else {what: row[what] for what in COUNTED}
-        if any(new.values()):
-            acted[name] = {"number": row["number"], **new}
-    return acted

@@ -101,12 +101,12 @@ def not_wanted(text: object, wanted: str) -> str:
         what, use = "a policy server", "give its address as --policy-server"
     elif isinstance(served, str):
         what, use = f"the environment {brief(served)}", "give its address as --transport"
+    elif not isinstance(name, str):
+        return ""
     elif data.get("agent"):
         what, use = f"a live agent (bam-agent) with {name}", "push to it with bam-push; --robot takes over from it"
-    elif isinstance(name, str):
-        what, use = f"the robot {name}", "give its address as --robot"
     else:
-        return ""
+        what, use = f"the robot {name}", "give its address as --robot"
     return f"that is {what}, and no {wanted}; {use}."
 
 

@@ -155,8 +155,9 @@ NO_AGENT = (
 def test_a_rosbridge_server_is_no_agent_and_where_nothing_listens_is_none():
     with BridgeServer(port=0) as server:
         assert refused(server.url) == f"{server.url}: {NO_AGENT}"
-        answers = {"success": True}
+        answers = {"success": True, "message": json.dumps({"agent": True})}  # it does not tell what it is
         server.serve(INFO_SERVICE, "std_srvs/Trigger", lambda *_: answers)
+        assert refused(server.url) == f"{server.url}: {NO_AGENT}"
         for told, what in (
             ({"name": "ur5e"}, "the robot ur5e, and no live agent; give its address as --robot."),
             ({"serves": "a policy"}, "a policy server, and no live agent; give its address as --policy-server."),

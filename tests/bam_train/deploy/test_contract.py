@@ -405,11 +405,8 @@ OTHER = "the robot there is fr3, and the policy is for ur5e: give the address of
         (WRONG, RobotInfo("fr3"), OTHER),
         (WRONG, RobotInfo("ur5e"), "correct the robot"),
         (WRONG, RobotInfo("ur5e", simulated=True), f"start the robot with {SERVE}"),
-        (
-            WRONG,
-            RobotInfo("ur5e", simulated=True, agent=True),
-            "give a policy for the environment of the live agent there",
-        ),
+        (WRONG, RobotInfo("ur5e", agent=True), "give a policy for the environment of the live agent there"),
+        (SLOW, RobotInfo("ur5e", agent=True), "correct the robot"),
         (
             SLOW,
             RobotInfo("ur5e", simulated=True),
