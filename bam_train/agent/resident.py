@@ -737,12 +737,12 @@ class Resident:
         return [*found, *([f"audit: {self.audit.fault}"] if self.audit.fault else [])]
 
     def _motion_warnings(self) -> Iterator[str]:
-        """Those of the guards, and of late ticks."""
+        """Those of the guards, and of late ticks, as long as they hold."""
         if self.session is None:
             return
-        warnings, late = self.session.deployment.journal.warnings, self.session.deployment.times.warning
-        yield from (f"{title}: {text}" for title, text in warnings.items())
-        if late and LATE not in warnings:
+        warnings, late = self.session.deployment.warnings, self.session.deployment.times.warning
+        yield from warnings
+        if late and not any(one.startswith(LATE) for one in warnings):
             yield f"late ticks: {late}"
 
     def _report(self, least: float = 0.0) -> None:
