@@ -28,7 +28,7 @@ from bam_train.agent.agent_messages import Answer, Ask, Drive, Halt, Message, Re
 from bam_train.agent.agent_options import AgentOptions
 from bam_train.agent.agent_states import TRANSITIONS, State
 from bam_train.agent.robot_session import RobotSession
-from bam_train.agent.succession import Choice, Succession
+from bam_train.agent.succession import Choice, Succession, done_by
 from bam_train.agent.transitions import TransitionCollector, TransitionLog, encode
 from bam_train.agent.versions import Versions
 from bam_train.checkpoint import Checkpoint
@@ -368,9 +368,11 @@ class Resident:
         else:
             self.post(set_choice)
 
-    def stage_of_champion(self) -> None:
-        """Move at the stage of the agent's setting from the next episode on."""
+    def promoted(self, why: str) -> None:
+        """The active version is the champion; it moves at the stage of the agent's setting from the next episode on."""
         self._stage = self.options.stage
+        if self.state.drives:
+            self._change(self._driving, why)
 
     def _slows(self, choice: Choice) -> bool:
         """Whether the episode ends first: the robot gets closer limits, or the policy computes its first chunk."""
@@ -563,9 +565,7 @@ class Resident:
     def _pause(self, who: str, address: str, why: str = "") -> dict[str, Any]:
         self.halt()
         self._is_running, self._stopped = False, ""
-        self._paused = (
-            f"paused by {who}{f': {why}' if why else ''}{f'; before that: {self._last_stop}' * bool(self._last_stop)}"
-        )
+        self._paused = done_by("paused", who, why) + f"; before that: {self._last_stop}" * bool(self._last_stop)
         if self.driver is not None:
             self._end_driving(self.driver, f"paused by {who}")
         if self.session is None:
@@ -582,7 +582,7 @@ class Resident:
         if self._last_stop:
             self.note("resume", f"{who} lets the robot move again after: {self._last_stop}", who, address)
         self._stopped, self._last_stop, self._paused, self._is_running = "", "", "", True
-        text = f"resumed by {who}{f': {why}' if why else ''}"
+        text = done_by("resumed", who, why)
         if self.session is None:
             self.note("resume", text, who, address)
         else:
@@ -652,8 +652,7 @@ class Resident:
         self.transitions.wanted = on
 
     def _roll_back(self, who: str, address: str, why: str = "") -> dict[str, Any]:
-        text = f"{who}{f': {why}' if why else ''}"
-        choice = self.succession.back(who, text)
+        choice = self.succession.back(who, done_by("rolled back", who, why))
         if self.succession.choice is not None:  # who waits for its outcome hears that, not that it was replaced
             self.succession.choice.result = self.succession.choice.result or choice.why
         self._chosen = choice
@@ -737,10 +736,11 @@ class Resident:
         return [f"{title}: {text}" for title, text in found.items()]
 
     def _motion_warnings(self) -> dict[str, str]:
-        """Those of the guards, and of late ticks, by title."""
+        """Those of the guards, and of late ticks, by title, as long as they hold."""
         if self.session is None:
             return {}
-        warnings, late = self.session.deployment.journal.warnings, self.session.deployment.times.warning
+        warnings = dict(one.split(": ", 1) for one in self.session.deployment.warnings)
+        late = self.session.deployment.times.warning
         return warnings if LATE in warnings or not late else {**warnings, "late ticks": late}
 
     def _report(self, least: float = 0.0) -> None:

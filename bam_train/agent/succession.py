@@ -44,6 +44,13 @@ _ONCE = {
     State.STOPPED: "somebody resumes the agent: bam-agent resume URL",
 }
 """What ends each state in which there are no trials."""
+_DONE = {"push": "pushed", "use": "chosen"}
+"""What was done, for each request of a version."""
+
+
+def done_by(what: str, who: str, why: str = "") -> str:
+    """What a person did, such as ``"paused by anna: the table is full"``."""
+    return f"{what} by {who}{f': {why}' if why else ''}"
 
 
 @dataclass
@@ -68,7 +75,7 @@ class Choice:
     outcome: threading.Event = field(default_factory=threading.Event)
     """Set once it was promoted or rolled back."""
     result: str = ""
-    """``"promoted"``, ``"rolled back"`` or ``"replaced"``, with the reason."""
+    """Such as ``"promoted: …"``, ``"rolled back: …"``, ``"rolled back by anna: …"`` or ``"replaced: …"``."""
 
     def close(self, result: str) -> None:
         """Tell whoever waits what became of it; the first result stands."""
@@ -97,8 +104,8 @@ class ActingAgent(Protocol):
     def choose(self, choice: Choice) -> None:
         """Let another version act as soon as it may."""
 
-    def stage_of_champion(self) -> None:
-        """Move at the stage of the agent's setting from the next episode on."""
+    def promoted(self, why: str) -> None:
+        """The active version is the champion; it moves at the stage of the agent's setting from the next episode on."""
 
     def status(self) -> dict[str, Any]:
         """The status of the agent."""
@@ -295,7 +302,7 @@ class Succession:
                 kind="TrialsNeeded",
             )
         at_once = ask.arguments.get("when", "episode") == "tick"
-        why = f"{ask.op} by {ask.who}"
+        why = done_by(_DONE[ask.op], ask.who, str(ask.arguments.get("why") or ""))
         champion = self.names[CHAMPION]
         if stage == "full" or digest == champion:  # the champion has no trial to pass
             names: dict[str, str | None] = {CANDIDATE: None}
@@ -339,6 +346,10 @@ class Succession:
     def back(self, who: str, why: str) -> Choice:
         """The choice that rolls back: from a candidate to the champion, else to the version before it.
 
+        Args:
+            who: The agent, or a person.
+            why: ``"rolled back"``, with the reason.
+
         Raises:
             RequestRefused: There is none.
         """
@@ -355,7 +366,7 @@ class Succession:
             text = f"{target[:12]} was trained on {version.env}, and the agent runs {self.active.env}"
             raise RequestRefused(f"There is no version to roll back to: {text}.")
         policy = self._policies.get(target) or load_policy(version)
-        return Choice(version, policy, names, f"rolled back: {why}", who, self._resident.options.stage)
+        return Choice(version, policy, names, why, who, self._resident.options.stage)
 
     def ended(self, record: EpisodeRecord) -> None:
         """Judge the active version after an episode."""
@@ -420,13 +431,13 @@ class Succession:
             self._promote(judgement.reason)
             return False
         try:
-            choice = self.back("the agent", judgement.reason)
+            choice = self.back("the agent", f"rolled back: {judgement.reason}")
         except RequestRefused as error:
             resident.note("trial", f"{self.active.digest[:12]} would be rolled back: {judgement.reason}. {error}")
             self.probation = None
             return False
         if self.choice is not None:
-            self.choice.result = self.choice.result or f"rolled back: {judgement.reason}"
+            self.choice.result = self.choice.result or choice.why
         resident.choose(choice)
         return True
 
@@ -438,7 +449,7 @@ class Succession:
         self.names |= {name: one for name, one in names.items() if one is not None}
         self._save()
         self._resident.note("promoted", f"{digest[:12]} is the champion: {reason}")
-        self._resident.stage_of_champion()
+        self._resident.promoted(f"promoted: {reason}")
         if self.choice is not None:
             self.choice.close(f"promoted: {reason}")
 

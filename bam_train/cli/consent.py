@@ -17,7 +17,7 @@ from bam_envs.core.wording import listed
 from bam_envs.safety.guard import is_base
 from bam_train.agent.agent_states import State
 from bam_train.checkpoint import Checkpoint
-from bam_train.cli.console import say
+from bam_train.cli.console import ask, say
 from bam_train.deploy.checkpoint_admission import bring_up, has_real_robot
 from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import SettingsError
@@ -181,8 +181,7 @@ def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) 
                 "a real robot would move, and there is nobody to ask; give --yes to go on without asking"
             )
         question = "Is the robot clear of people, and a hand on its emergency stop? Type yes to go on: "
-        print(question, end="", file=sys.stderr, flush=True)
-        if sys.stdin.readline().strip().lower() != "yes":
+        if ask(question, partial(print, end="", file=sys.stderr, flush=True)) != "yes":
             raise SettingsError("the answer was not yes; nothing has moved")
     if services:
         enable()

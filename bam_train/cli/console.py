@@ -41,6 +41,23 @@ def tell(*lines: str) -> None:
     print("\n".join(map(shown, lines)), flush=True)
 
 
+def ask(question: str, write: Callable[[str], None]) -> str:
+    """Write `question` to the terminal that is standard input; returns the line typed from then on, in lower case.
+
+    What was typed ahead of the question, in lines or in part of one, is thrown away: it answers something else. The
+    answer is empty at the end of input, and if the terminal is gone.
+    """
+    import termios
+
+    try:
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
+    except termios.error:  # the terminal is gone
+        return ""
+    write(question)
+    with open(sys.stdin.fileno(), errors="replace", closefd=False) as typed:  # without what sys.stdin has read ahead
+        return typed.readline().strip().lower()
+
+
 def drop(stream: TextIO) -> None:
     """Discard the content of the stream's buffer, and all later writes to the stream."""
     with contextlib.suppress(OSError):  # a stream without a file

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import zip_longest
@@ -14,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from bam_envs.core.timing import Pacer
-from bam_train.cli.console import rich_text
+from bam_train.cli.console import ask, rich_text
 from bam_train.deploy.journal import EpisodeRecord, Journal, lateness_text, rate_text
 from bam_train.files.log_lines import counted
 
@@ -54,13 +53,13 @@ class PlainDeployment:
     def judge(self, record: EpisodeRecord) -> bool | None:
         """Ask the operator whether the policy did its task, which the environment does not say; None: no answer."""
         for _ in range(_ASKED):
-            self._write(f"Did it do its task in the episode with seed {record.seed}? Type yes or no:")
-            if (answer := self._typed()) in ("yes", "no"):
+            answer = self._ask(f"Did it do its task in the episode with seed {record.seed}? Type yes or no:")
+            if answer in ("yes", "no"):
                 return answer == "yes"
         return None
 
-    def _typed(self) -> str:
-        return sys.stdin.readline().strip().lower()
+    def _ask(self, question: str) -> str:
+        return ask(question, self._write)
 
 
 class LiveDeployment(PlainDeployment):
@@ -85,13 +84,13 @@ class LiveDeployment(PlainDeployment):
         super().__init__(journal, lambda line: live.console.print(rich_text(line)))
         self._live, self._env, self._title, self._now, self._drawn = live, env, title, now, -math.inf
 
-    def _typed(self) -> str:
+    def _ask(self, question: str) -> str:
         from rich.control import Control
         from rich.segment import ControlType
 
-        typed = super()._typed()
+        answer = super()._ask(question)
         self._live.console.control(Control((ControlType.CURSOR_UP, 1)))  # back to the last line of the panel
-        return typed
+        return answer
 
     def ticked(self, record: EpisodeRecord, action: Any, pacer: Pacer) -> None:
         """As there, and redraw if it is time and there is time."""

@@ -113,6 +113,7 @@ def _directory(config: ExportConfig, path: Path) -> Exported:
 
 def _write(config: ExportConfig, exported: Exported) -> None:
     """Write the checkpoint, and say what it is and what comes next."""
+    from bam_envs.core.registry import ENVIRONMENTS, resolve_id
     from bam_train.checkpoint import POLICY
     from bam_train.compat.exported import EXPORTED
     from bam_train.environments import must_be_named
@@ -141,9 +142,14 @@ def _write(config: ExportConfig, exported: Exported) -> None:
             f"  next      bam-serve --policy {path} --bind ADDRESS --port 9096, on this computer; at the robot, with",
             f"            the same file, bam-deploy {named} --policy-server ws://ADDRESS:9096",
         ]
+    length = []
+    if env == resolve_id(JOINTS) and not fields["env_kwargs"].get("max_episode_steps"):
+        long = f"{ENVIRONMENTS[env].max_episode_steps} steps each, four times as many on trial"
+        length = [f"  episodes  {long}; --set max_episode_steps=N sets another length"]
     tell(
         f"{path}: {algo} on {env}{several}{steps}, out of {exported.place}{f' of Ray {ray}' if ray else ''}",
         f"  checked   against the actions of {exported.checked_by}: they differ by {exported.difference:.1e} at most",
+        *length,
         *next_,
         *resume,
     )

@@ -140,6 +140,8 @@ class Deployment:
         self._loop.policy.reset()  # nothing that it has planned is sent
         policy.reset()
         self._loop.policy = self._beside(policy)
+        self._forget_unusual()
+        self.journal.unusual = None
 
     def _beside(self, policy: Any) -> Any:
         """The policy itself, or in a thread beside the loop."""
@@ -168,6 +170,7 @@ class Deployment:
         finally:
             if isinstance(self._loop.policy, Background):
                 self._loop.policy.reset()  # nothing that it has planned is sent
+            self._forget_unusual()
         self._halt()  # the sink and the next reset may be slow
         if self.trials is not None and record.end != "stopped":
             self._end_trial(self.trials, record)
@@ -202,6 +205,16 @@ class Deployment:
         if not self._closed:
             halt_and_close(self.env)
             self._closed = True
+
+    def _forget_unusual(self) -> None:
+        """End the warning of unusual observations: it is of one policy, in one episode."""
+        if (tell := getattr(robot_of(self.env), "tell_unusual", None)) is not None:
+            tell("")
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The current warnings of the robot's guards, and of the policy; the journal has the earlier ones too."""
+        return self._loop.warnings
 
     @property
     def times(self) -> TickTimes:

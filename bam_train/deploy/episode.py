@@ -179,10 +179,14 @@ class EpisodeLoop:
         self._raise_again()  # after a signal whose exception was lost, nothing more is sent
         return step.followed_by(perf_counter(), self._env.step(step.action.copy()), self._env.observation_space)
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The current warnings of the robot's guards, and of the policy."""
+        return (*getattr(robot_of(self._env), "warnings", ()), *getattr(self.policy, "warnings", ()))
+
     def _write_down(self, step: EpisodeStep, watcher: Watcher) -> None:
         """Into the journal, and before the operator's eyes."""
-        warnings = (*getattr(robot_of(self._env), "warnings", ()), *getattr(self.policy, "warnings", ()))
-        self._journal.warn(warnings)
+        self._journal.warn(self.warnings)
         record = self._journal.step(step.reward, step.success, step.end)
         watcher.ticked(record, step.action, self._pacer)
         if step.is_last:

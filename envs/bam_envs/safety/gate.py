@@ -357,7 +357,10 @@ class SafeRobot(metaclass=Sealed):
                 guard.react(reaction)
 
     def tell_unusual(self, reason: str) -> None:
-        """Take the reason why the observations of this episode are unusual for the policy; see `react`."""
+        """Take the reason why the observations of this episode are unusual for the policy; see `react`.
+
+        An empty one ends a warning, once the episode has ended or another policy acts, and neither a hold nor a stop.
+        """
         for guard in self._guards:
             if isinstance(guard, UnusualObservations):
                 guard.told(reason)

@@ -23,8 +23,9 @@ class UnusualObservations(Guard):
         self._reaction, self.patience = reaction, 1 if reaction == "stop" else math.inf
 
     def told(self, reason: str) -> None:
-        """Take the reason why a score is above 1, which is kept until the episode ends."""
-        self.warning = self.warning or reason
+        """Take the reason why a score is above 1, which is kept until the episode ends; "" ends one that only warns."""
+        if reason or self._reaction == "warn":
+            self.warning = reason and (self.warning or reason)
 
     def forgive(self) -> None:
         """Forget the reason, when an episode begins or a person resumes the robot."""

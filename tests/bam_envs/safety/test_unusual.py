@@ -26,6 +26,9 @@ def test_by_default_it_warns_until_the_next_episode(robot):
     robot.tell_unusual("the robot answers otherwise")
     robot.step(HOME)
     assert (robot.status, robot.warnings) == ("", ("unusual observations (G19): another place",))
+    robot.tell_unusual("")
+    assert robot.warnings == ()
+    robot.tell_unusual("another place")
     robot.reset(np.array([0]), START)
     assert robot.warnings == ()
 
@@ -36,6 +39,7 @@ def test_it_holds_until_the_next_episode(robot):
     robot.tell_unusual("another place")
     for _ in range(30):
         state = robot.step(moved)
+        robot.tell_unusual("")  # another policy acts: the robot is held on
     assert (robot.status, robot.code, robot.stopped) == ("unusual observations (G19)", 19, None)
     np.testing.assert_array_equal(state.command[0, :6], ARM_HOME)
     assert robot.report()["unusual observations"]["held"] == 30

@@ -21,7 +21,7 @@ PICK = Path(__file__).parents[3] / "checkpoints" / "pick-ppo.zip"
 REACH = PICK.with_name("reach-ppo.zip")
 STATUS = {
     "state": "trial",
-    "why": "push by anna@laptop",
+    "why": "pushed by anna@laptop",
     "since": 1.0,
     "active": DIGEST,
     "names": {"champion": 64 * "1", "candidate": DIGEST},
@@ -96,7 +96,7 @@ def test_status(hub, server, run):
     lines = out.splitlines()
     assert status == 0
     assert lines[0].startswith(LINES[0])
-    assert lines[0].endswith(": push by anna@laptop")
+    assert lines[0].endswith(": pushed by anna@laptop")
     assert lines[1:] == LINES[1:]
     status, out, _ = run(agent.main, "status", server.url, "--json", token="w")
     assert (status, json.loads(out)) == (0, STATUS)

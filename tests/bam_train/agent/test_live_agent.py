@@ -247,12 +247,13 @@ def test_a_push_acts_between_two_ticks_and_is_rolled_back(running, tmp_path, for
     candidate.write_bytes(PICK.read_bytes())
     candidate = forge(candidate, seed=7)
     champion = running.state()["active"]
-    pushed = running.agent.push(candidate, when="tick")
+    pushed = running.agent.push(candidate, when="tick", why="it is faster")
     assert pushed["names"]["candidate"] == pushed["digest"] == running.state("trial")["active"] != champion
+    assert running.state("trial")["why"] == "pushed by anna@laptop: it is faster"
     back = running.agent.ask("rollback", why="too slow")
     assert (back["active"], back["names"]["champion"]) == (champion, champion)
     running.state("running")
-    for text in ("push by anna@laptop", "rolled back: anna@laptop: too slow"):
+    for text in ("pushed by anna@laptop: it is faster", "rolled back by anna@laptop: too slow"):
         running.line(f"acts instead of {(champion if 'push' in text else pushed['digest'])[:12]}: {text}")
 
 

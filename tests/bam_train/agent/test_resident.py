@@ -3,6 +3,7 @@
 import queue
 import threading
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -54,6 +55,7 @@ class Session:
             swap=lambda policy: None,
             trials=None,
             latency=0.0,
+            warnings=(),
             sent=lambda tick, state: None,
             record_command=lambda: None,
         )
@@ -270,7 +272,7 @@ def test_late_ticks_are_said_in_the_log_but_not_in_each_report(bench):
         session = running.agent.session
         for tick in [IN_TIME] * 94 + [LATE] * 4 + [SLOW] * 2:
             session.deployment.times.add(*tick)
-        session.deployment.journal.warn(["link quality (G16): only 93 of the last 100 ticks"])
+        session.deployment.warnings = ("link quality (G16): only 93 of the last 100 ticks",)
         running.ask("pause")
         late = "late ticks: 6 of the last 100 ticks missed their deadline, 2 of them because of the policy"
         late += ": end other programs"
@@ -281,9 +283,9 @@ def test_late_ticks_are_said_in_the_log_but_not_in_each_report(bench):
         running.ask("pause")
         assert running.status["warnings"][1] == late.replace("6 of the last", "7 of the last")
         assert len(warned()) == 2
-        session.deployment.journal.warn([f"{LATE_TICKS}: 7 of the last 100 commands were late"])  # says the same
+        session.deployment.warnings = (f"{LATE_TICKS}: 7 of the last 100 commands were late",)  # says the same
         running.ask("resume")
-        assert [one.partition(":")[0] for one in running.status["warnings"]] == ["link quality (G16)", LATE_TICKS]
+        assert running.status["warnings"] == [*session.deployment.warnings]  # the link is good again
 
 
 def test_what_the_front_process_logs_is_not_logged_twice(bench):
@@ -360,7 +362,7 @@ def candidate(forge, tmp_path):
         path = tmp_path / "candidate.zip"
         path.write_bytes(PICK.read_bytes())
         version = running.agent.succession.versions.add(Checkpoint.open(forge(path, seed=7)))
-        choice = Choice(version, None, {CANDIDATE: version.digest}, "push by anna", "anna", trials=trials)
+        choice = Choice(version, None, {CANDIDATE: version.digest}, "pushed by anna", "anna", trials=trials)
         running.agent.choose(choice)
         assert choice.active.wait(DEADLINE)
         return choice
@@ -404,7 +406,7 @@ def test_a_candidate_is_rolled_back_for_its_own_stops_only(bench, candidate, sto
             running.ask("pause")
             running.ask("rollback", why="it drops the cube")
             assert choice.outcome.wait(DEADLINE)
-            assert choice.result == "rolled back: anna: it drops the cube"
+            assert choice.result == "rolled back by anna: it drops the cube"
     excused = [text for what, text, *_ in running.events if what == "trial"]
     assert len(excused) == (0 if is_back else 2)
 
@@ -429,6 +431,29 @@ class BookedTrials:
         if self._runs:
             self.rows.append((success, reason, void))
         self._runs = False
+
+
+def test_after_a_promotion_the_state_says_why(bench, candidate):
+    def connect(*arguments, **more):
+        session = Session(running.agent, running.faults)
+
+        def episode(watcher, seed):
+            record = session.deployment.journal.begin(seed)
+            while not (session.deployment.trials or running.agent.between_ticks()):
+                pass  # until the candidate is pushed
+            return replace(record, success=True, end="terminated") if session.deployment.trials else record
+
+        session.deployment.episode = episode
+        return session
+
+    running = bench(connect=connect)
+    with running:
+        running.state(State.RUNNING)
+        assert candidate(running, BookedTrials()).outcome.wait(DEADLINE)
+    assert running.changes()[1:] == [
+        (State.TRIAL.value, "pushed by anna", "anna"),
+        (State.RUNNING.value, "promoted: 1 of 1", "the agent"),
+    ]
 
 
 @pytest.mark.parametrize("at", ["on the way to its start", "in mid-episode"])
@@ -470,7 +495,7 @@ def test_an_episode_of_another_version_is_no_trial_of_a_candidate(bench, candida
         assert choice.outcome.wait(DEADLINE)
         running.state(State.RUNNING)
     assert played
-    ended = [(False, "another version acts: rolled back: rolled back", True)] if at == "in mid-episode" else []
+    ended = [(False, "another version acts: rolled back", True)] if at == "in mid-episode" else []
     assert trials.rows == (["begun", *ended] if at == "in mid-episode" else ended)
 
 

@@ -56,7 +56,7 @@ class Agent:
         if replaced is not None:
             replaced.close("replaced: another version acts")
 
-    def stage_of_champion(self):
+    def promoted(self, why):
         pass
 
     def status(self):
@@ -85,7 +85,8 @@ def better(tmp_path, forge):
 
 def test_a_pushed_candidate_acts_and_is_promoted_by_its_trials(agent, better):
     old, new = agent.succession.active.digest, Checkpoint.open(better).digest
-    answer = agent.ask("push", path=str(better), file="better.zip")
+    answer = agent.ask("push", path=str(better), file="better.zip", why="it is faster")
+    assert agent.succession.choice.why == "pushed by anna: it is faster"
     assert (answer.error, answer.result["digest"]) == ("", new)
     assert answer.result["lines"][1] == "fits bam/pick-v0: spaces, 50 signals, period 0.05 s"
     assert not better.exists()
@@ -158,7 +159,7 @@ def test_who_waits_for_the_trials_is_told_why_they_rest(agent, better, until, fi
         until(lambda: agent.sent[-1] == RequestProgress(1, f"is the candidate; {paused}"))
         tell(State.TRIAL, "resumed by bob", "the trials begin")
     else:
-        tell(State.TRIAL, "push by anna", "acts as the candidate; its trials decide")
+        tell(State.TRIAL, "pushed by anna", "acts as the candidate; its trials decide")
     why = "The robot was stopped by following (G23): the elbow is away. When it is safe, resume the agent."
     tell(State.STOPPED, why, f"the agent is stopped by a guard {since}: {why} {resume}")
     tell(State.TRIAL, "resumed by bob", "the trials go on")

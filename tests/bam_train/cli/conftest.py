@@ -1,7 +1,11 @@
 from __future__ import annotations
 
+import contextlib
+import io
 import multiprocessing
 import os
+import pty
+import sys
 import threading
 
 import gymnasium as gym
@@ -16,6 +20,35 @@ def cartpole_checkpoint(corridor_checkpoint):
     env = gym.make("CartPole-v1")
     spaces = {name: space_to_json(getattr(env, name)) for name in ("observation_space", "action_space")}
     return corridor_checkpoint("cartpole.zip", env="CartPole-v1", **spaces)
+
+
+class Person(io.TextIOBase):
+    """A terminal as standard input, and a stream that shows questions to the person there, who answers one by one."""
+
+    def __init__(self, terminal, shows, answers):
+        self._terminal, self._shows, self._answers = terminal, shows, [*answers]
+
+    def write(self, text):
+        self._shows.write(text)
+        if "Type yes" in text and self._answers:
+            os.write(self._terminal, self._answers.pop(0).encode())
+        return len(text)
+
+
+@pytest.fixture
+def person(monkeypatch):
+    """Sits a person down: ``person(shows, answers, ahead)`` gives the stream that the person reads."""
+    with contextlib.ExitStack() as stack:
+
+        def sit(shows, answers, ahead=""):
+            ours, theirs = pty.openpty()
+            stack.callback(os.close, ours)
+            monkeypatch.setattr(sys, "stdin", stack.enter_context(os.fdopen(theirs)))
+            os.write(ours, ahead.encode())
+            return Person(ours, shows, answers)
+
+        yield sit
+        monkeypatch.undo()
 
 
 LONGEST = 300.0

@@ -39,18 +39,24 @@ class RealArm:
         self.trouble, self.enabling = None, ()
 
 
-def consent(monkeypatch, robot, answer=None, yes=False, plan=()):
-    """Ask, with somebody who types `answer` or with nobody there."""
-    monkeypatch.setattr(sys, "stdin", io.StringIO(answer or ""))
-    monkeypatch.setattr(sys.stdin, "isatty", lambda: answer is not None, raising=False)
-    env = SimpleNamespace(unwrapped=SimpleNamespace(robot=robot))
-    require_consent(env, "bam-deploy: pick.zip", yes=yes, plan=plan)
+@pytest.fixture
+def consent(monkeypatch, person):
+    """Asks, with somebody who types `answer` after the question, and `ahead` before it, or with nobody there."""
+
+    def consent(robot, answer=None, yes=False, plan=(), ahead=""):
+        monkeypatch.setattr(sys, "stdin", io.StringIO())
+        if answer is not None:
+            monkeypatch.setattr(sys, "stderr", person(sys.stderr, [answer], ahead))
+        env = SimpleNamespace(unwrapped=SimpleNamespace(robot=robot))
+        require_consent(env, "bam-deploy: pick.zip", yes=yes, plan=plan)
+
+    return consent
 
 
-def test_before_a_real_robot_moves_its_limits_are_shown_and_somebody_asked(monkeypatch, capsys):
+def test_before_a_real_robot_moves_its_limits_are_shown_and_somebody_asked(consent, capsys):
     robot = RealArm()
     robot.report = lambda: {**GUARDS, "laser zones": {"number": "G12", "limit": math.inf, "unit": "m"}}
-    consent(monkeypatch, robot, "yes\n")
+    consent(robot, "yes\n")
     assert capsys.readouterr().err == (
         "bam-deploy: pick.zip will move ur5e at ws://10.0.0.5:9090:\n"
         "  at most joint speed 3.14 rad/s\n"
@@ -81,12 +87,12 @@ def test_before_a_real_robot_moves_its_limits_are_shown_and_somebody_asked(monke
         ),
     ],
 )
-def test_what_it_will_do_is_shown(monkeypatch, capsys, spec, episodes, expected):
+def test_what_it_will_do_is_shown(consent, capsys, spec, episodes, expected):
     robot = RealArm()
     robot.spec = spec
     env = SimpleNamespace(unwrapped=SimpleNamespace(robot=robot))
     plan = plan_lines(env, "bam/pick-v0", "ws://10.0.0.5:9090", episodes)
-    consent(monkeypatch, robot, yes=True, plan=plan)
+    consent(robot, yes=True, plan=plan)
     assert capsys.readouterr().err == (
         "bam-deploy: pick.zip will move ur5e at ws://10.0.0.5:9090:\n"
         f"  address: ws://10.0.0.5:9090\n{expected}  at most joint speed 3.14 rad/s\n"
@@ -94,47 +100,47 @@ def test_what_it_will_do_is_shown(monkeypatch, capsys, spec, episodes, expected)
     )
 
 
-@pytest.mark.parametrize("answer", ["no\n", "\n", "", "y\n", None])
-def test_any_other_answer_than_yes_is_no(monkeypatch, answer):
+@pytest.mark.parametrize("answer", ["no\n", "\n", "\x04", "y\n", None])
+def test_any_other_answer_than_yes_is_no(consent, answer):
     message = "the answer was not yes; nothing has moved"
     if answer is None:
         message = "a real robot would move, and there is nobody to ask; give --yes to go on without asking"
     with pytest.raises(SettingsError, match=f"^{message}$"):
-        consent(monkeypatch, RealArm(), answer)
+        consent(RealArm(), answer, ahead="yes\n")
 
 
-def test_nobody_is_asked_about_a_robot_that_is_not_ready(monkeypatch):
+def test_nobody_is_asked_about_a_robot_that_is_not_ready(consent):
     robot = RealArm()
     robot.trouble = "protective stop (/io_and_status_controller/safety_mode)"
     with pytest.raises(SettingsError) as caught:
-        consent(monkeypatch, robot, yes=True)
+        consent(robot, yes=True)
     assert str(caught.value) == (
         "not ready: protective stop (/io_and_status_controller/safety_mode); nothing has moved"
     )
 
 
-def test_a_robot_is_enabled_once_somebody_has_agreed(monkeypatch, capsys):
+def test_a_robot_is_enabled_once_somebody_has_agreed(consent, capsys):
     robot = RealArm()
     robot.trouble = "the motors are off"
     robot.enabling = (SimpleNamespace(service="/arm/motion_enable", does="enables the motors"),)
     with pytest.raises(SettingsError, match=r"^the answer was not yes; nothing has moved$"):
-        consent(monkeypatch, robot, "no\n")
+        consent(robot, "no\n")
     assert len(robot.enabling) == 1
     capsys.readouterr()
-    consent(monkeypatch, robot, "yes\n")
+    consent(robot, "yes\n")
     assert robot.enabling == ()
     assert "\n  first /arm/motion_enable is called, which enables the motors\n" in capsys.readouterr().err
     robot.enabling, robot.enable = (SimpleNamespace(service="/a", does="b"),), lambda: None
     robot.trouble = "the motors are off"
     with pytest.raises(SettingsError, match=r"^not ready: the motors are off; nothing has moved$"):
-        consent(monkeypatch, robot, yes=True)
+        consent(robot, yes=True)
 
 
-def test_simulated_robots_move_without_asking(monkeypatch, capsys):
+def test_simulated_robots_move_without_asking(consent, capsys):
     served = RealArm()
     served.info = SimpleNamespace(simulated=True, text="ur5e, simulated")
     served.enabling = (SimpleNamespace(service="/a", does="b"),)
-    consent(monkeypatch, served)
+    consent(served)
     assert served.enabling == ()
-    consent(monkeypatch, None)
+    consent(None)
     assert capsys.readouterr().err == ""

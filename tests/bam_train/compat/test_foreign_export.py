@@ -73,6 +73,8 @@ def test_order_units_and_rate_become_those_of_the_robot(described, run, tmp_path
     assert said.splitlines()[0] == (
         f"{out}: act on bam/joints-v0, 2 actions at once, 2 of them executed, out of {tmp_path / 'act.toml'}"
     )
+    longer = "600 steps each, four times as many on trial; --set max_episode_steps=N sets another length"
+    assert said.splitlines()[2] == f"  episodes  {longer}"
     manifest = Checkpoint.open(out).manifest
     assert (manifest.chunk, manifest.period, manifest.trainer) == (Chunk(2, 2), 1 / rate, "onnx")
     assert [one["name"] for one in manifest.signals["action"]] == [*JOINTS, "gripper_width"]
@@ -88,8 +90,11 @@ def test_order_units_and_rate_become_those_of_the_robot(described, run, tmp_path
 
 def test_an_image_has_its_channels_first(described, run, tmp_path):
     out = tmp_path / "act.zip"
-    assert run(main, described(pixels=True), "--robot-model", "so101", "--out", out)[0] == 0
+    shorter = "--set", "max_episode_steps=50"
+    status, said, _ = run(main, described(pixels=True), "--robot-model", "so101", "--out", out, *shorter)
+    assert (status, "episodes" in said) == (0, False)
     kwargs = Checkpoint.open(out).manifest.env_kwargs
+    assert make_env("bam/joints-v0", kwargs).spec.max_episode_steps == 50
     assert (kwargs["camera"], kwargs["image_size"]) == (["front"], [64, 48])  # the policy's, without --set
     black = {"front": np.zeros((48, 64, 3), np.uint8), "robot": SEEN}
     np.testing.assert_allclose(FrozenPolicy.load(out).act(black), SEEN, atol=1e-6)

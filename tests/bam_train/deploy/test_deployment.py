@@ -309,6 +309,9 @@ def test_the_detector_gets_the_command_that_guards_have_changed_and_the_time_bet
     robot = SafeRobot(arm, [Hold()], limits=Limits().on_trial(base=False))
     env = gym.wrappers.TimeLimit(RobotEnv(robot, ReachTask(1)), 5)
     policy, sent = Right(np.array([1, 0, 0, 0, 0, 0], np.float32)), []
+    robot.tell_unusual("of the policy before")
+    Deployment(env, policy, Pacer(None), Journal(1)).swap(policy)
+    assert robot.warnings == ()
     policy.detector = spy = Spy()
     step = arm.step
     arm.step = lambda command: (sent.append(command[0].tolist()), step(command))[1]
@@ -319,7 +322,8 @@ def test_the_detector_gets_the_command_that_guards_have_changed_and_the_time_bet
     np.testing.assert_allclose([periods for _, periods, _ in spy.ticks[1:]], 1.0)
     assert [held for _, _, held in spy.ticks] == [False, False, True, False, False]
     assert (journal.highest, journal.alarms) == (2.0, 1)
-    assert robot.warnings == ("unusual observations (G19): another place (score 2.00, usual is at most 1)",)
+    assert journal.warnings == {"unusual observations (G19)": "another place (score 2.00, usual is at most 1)"}
+    assert robot.warnings == ()  # it ends with the episode
 
 
 @pytest.mark.parametrize(

@@ -143,8 +143,8 @@ def test_of_a_recording_of_several_policies_a_checkpoint_is_compared_with_its_ow
     other.write_bytes(PICK.read_bytes())
     own, other = Checkpoint.open(PICK).digest, Checkpoint.open(forge(other, seed=7)).digest
     times, with_swaps = Recording.open(pick).tables["/episode"].times.tolist(), tmp_path / "agent.mcap"
-    texts = [f"{other[:12]} acts instead of {own[:12]}: push by anna (anna)"]
-    texts += [f"{own[:12]} acts instead of {other[:12]}: rolled back: bob (bob)"]
+    texts = [f"{other[:12]} acts instead of {own[:12]}: pushed by anna (anna)"]
+    texts += [f"{own[:12]} acts instead of {other[:12]}: rolled back by bob (bob)"]
     events = [Event(times[at] - 1, 2, text) for at, text in zip((20, 50), texts, strict=True)]
     with_swaps.write_bytes(rewritten(pick, events))
 
