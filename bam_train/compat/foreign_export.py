@@ -53,10 +53,8 @@ def export_foreign(
         PolicyError: Its graph cannot be used, or does not act as its own library does.
     """
     if policy.network and policy.chunk.overlap is not None:
-        text = (
-            "overlap: its graph makes each chunk by itself; LeRobot's SmolVLA and pi0, which are --served, continue one"
-        )
-        raise PolicyError(f"{policy.place}: {text}")
+        text = "overlap: its graph makes each chunk by itself"
+        raise PolicyError(f"{policy.place}: {text}; LeRobot's SmolVLA and pi0, which are --served, continue one")
     policy = with_known_sizes(policy) if policy.network else policy
     env_kwargs = {**_usual(policy, env_id), **env_kwargs}
     session, frozen, graph, (signals, period) = _joined(policy, env_id, env_kwargs, tell)
@@ -152,8 +150,8 @@ class LibrarySession:
     def run(self, inputs: Mapping[str, Array], _: Sequence[str]) -> list[Array]:
         """The chunk, (1, size, ...), for arrays (1, ...)."""
         ours = {name: (inputs[ours], means) for name, (ours, _, means) in self.taken.items()}
-        ours |= {name: (inputs[name], self.given) for name in inputs if name == LEFT}
-        known = {name: inputs[name] for name in inputs if name == KNOWN}
+        known = {} if self.policy.chunk.overlap is None else {KNOWN: inputs[KNOWN]}
+        ours |= {LEFT: (inputs[LEFT], self.given)} if known else {}
         chunk = np.asarray(self._answer({**as_theirs(self._ports, ours), **known}))
         return [as_ours(self.policy, chunk, self.given, self.shape)[None]]
 
