@@ -74,8 +74,6 @@ class DataSetWriter:
             self.undo()
             raise
         self._counted = self._head
-        if not together:
-            self._before = {}
 
     def _open(self) -> None:
         files = self._files
@@ -195,6 +193,7 @@ class DataSetWriter:
             kept, lost = (counted(one, "whole episode") for one in (self._head.episodes, len(self._waiting)))
             raise OutputError(f"{error}. Kept in {self._files.text}: {kept}; not written: {lost}") from error
         self._head, self._waiting, self._bytes = head, [], 0
+        self._before = self._before if self._together else {}
 
     def commit(self) -> None:
         """Flush, and let what was added `together` count; until it is closed, `undo` takes it back."""
@@ -204,7 +203,10 @@ class DataSetWriter:
             self._counted = self._head
 
     def undo(self) -> None:
-        """Take back what was added `together`, and let others write; a data set that was made is removed."""
+        """Take back what was added `together`, or since the last flush, and let others write.
+
+        A data set that was made for it is removed.
+        """
         if not self._lock.is_held:
             return
         try:
@@ -234,7 +236,7 @@ class DataSetWriter:
             try:
                 self.commit()
             except BaseException:
-                self.undo() if self._together else self._lock.release()
+                self.undo()
                 raise
             self._lock.release()
 

@@ -112,6 +112,15 @@ def test_a_second_writer_hears_who_is_first(tmp_path):
         assert writer.add(episode(info_of(), 2)) == 1
 
 
+def test_undo_takes_back_what_is_not_flushed(tmp_path):
+    with DataSetWriter(tmp_path / "d", info_of()) as writer:
+        writer.add(episode(info_of(), 2, 0))
+        writer.flush()
+        writer.add(episode(info_of(), 2, 1))
+        writer.undo()
+    assert [one.facts["seed"] for one in DataSet.open(tmp_path / "d")] == [0]
+
+
 def test_a_full_disk_says_what_is_kept_and_the_rest_is_written_once_there_is_room(tmp_path, monkeypatch):
     """Every write of a flush can fail."""
     info = info_of()
