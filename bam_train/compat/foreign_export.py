@@ -174,9 +174,8 @@ def _detector(
     policy: ForeignPolicy, taken: Mapping[str, tuple[str, Any, Meaning]], given: Meaning, count: int
 ) -> Detector | None:
     """The detector of unusual observations, of the ranges of the numbers in the data; None if they are not known."""
-    seen = {taken[port.name][0]: port for port in policy.inputs if not port.is_image}
-    found = [(port, *taken[port.name][1:]) for _, port in sorted(seen.items())]
-    ranges = [_range(port, means, math.prod(part.shape)) for port, part, means in found]
+    seen = {taken[port.name][0]: (port, *taken[port.name][1:]) for port in policy.inputs if not port.is_image}
+    ranges = [_range(port, means, math.prod(part.shape)) for _, (port, part, means) in sorted(seen.items())]
     d = sum(len(low) for low, _ in ranges)
     low, high = np.concatenate([*ranges, _range(policy.output, given, count)], axis=1)
     few = 0 < d <= MOST_NUMBERS and len(low) - d <= MOST_NUMBERS

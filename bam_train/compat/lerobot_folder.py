@@ -13,7 +13,6 @@ from dataclasses import asdict
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -59,7 +58,7 @@ def lerobot_policy(
     units: Units | None = None,
     served: bool = False,
     task: str = "",
-    chunk: Mapping[str, Any] = MappingProxyType({}),
+    chunk: Mapping[str, Any] | None = None,
 ) -> ForeignPolicy:
     """The policy in a folder ``pretrained_model``.
 
@@ -91,7 +90,7 @@ def lerobot_policy(
     theirs = {new: old for old, new in renamed.items()}
     with _reading(folder, kind):
         network = _Library(folder, kind, task, theirs) if served else _Network(folder, kind)
-    asked = _chunk(folder, network.chunk, chunk)
+    asked = _chunk(folder, network.chunk, chunk or {})
     if isinstance(network, _Library) and asked.overlap is not None:
         network.overlap(folder, kind, asked.overlap)
     norms = {name: _norms(folder, found) for name, found in steps.items()}
