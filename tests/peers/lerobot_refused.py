@@ -17,11 +17,16 @@ from bam_train.cli.export import main
 
 made, copies = Path(sys.argv[1]), Path(sys.argv[2])
 STATE, FLAGS = "observation.state", ("--robot-model", "so101", "--units", "degrees")
-NORMALIZER = "policy_preprocessor_step_3_normalizer_processor.safetensors"
+BEFORE, NORMALIZER = "policy_preprocessor.json", "policy_preprocessor_step_3_normalizer_processor.safetensors"
 
 
-def edit(path, change):
-    path.write_text(change(path.read_text()))
+def replaced(name, *change):
+    """Replace text in a file."""
+
+    def damage(folder):
+        (folder / name).write_text((folder / name).read_text().replace(*change))
+
+    return damage
 
 
 def without_mean(folder):
@@ -29,33 +34,16 @@ def without_mean(folder):
     save_file({name: one for name, one in arrays.items() if name != f"{STATE}.mean"}, folder / NORMALIZER)
 
 
-def without_state(folder):
-    """As of a normaliser that was never given statistics."""
-
-    def change(text):
-        steps = json.loads(text)
-        steps["steps"][3].pop("state_file")
-        return json.dumps(steps)
-
-    edit(folder / "policy_preprocessor.json", change)
-
-
 DAMAGES = {
-    "no processors": lambda folder: (folder / "policy_preprocessor.json").unlink(),
-    "unknown step": lambda folder: edit(
-        folder / "policy_preprocessor.json", lambda text: text.replace("to_batch_processor", "delta_action_processor")
-    ),
+    "no processors": lambda folder: (folder / BEFORE).unlink(),
+    "unknown step": replaced(BEFORE, "to_batch_processor", "delta_action_processor"),
     "no file of statistics": lambda folder: (folder / NORMALIZER).unlink(),
-    "no statistics": without_state,
+    "no statistics": replaced(BEFORE, '"state_file"', '"no_file"'),  # as of a normaliser that was never given any
     "no mean": without_mean,
-    "another version": lambda folder: edit(
-        folder / "config.json", lambda text: text.replace("{", '{"attention_of_tomorrow": true, ', 1)
-    ),
-    "another size": lambda folder: edit(
-        folder / "config.json", lambda text: text.replace('"dim_model": 32', '"dim_model": 64')
-    ),
+    "another version": replaced("config.json", "{", '{"attention_of_tomorrow": true, ', 1),
+    "another size": replaced("config.json", '"dim_model": 32', '"dim_model": 64'),
     "cut weights": lambda folder: (folder / "model.safetensors").write_bytes(b"\x10\0\0"),
-    "no steps": lambda folder: (folder / "policy_preprocessor.json").write_text("{}"),
+    "no steps": lambda folder: (folder / BEFORE).write_text("{}"),
 }
 CHUNKS = ("size=5", "steps=9", "ensemble=much", "stpes=4", "overlap=4")
 
