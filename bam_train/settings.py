@@ -243,6 +243,11 @@ def parse_assignment(text: str, example: str, flag: str = "--set") -> tuple[list
         return path, typed
 
 
+def read_named(texts: Sequence[str], example: str, flag: str = "--set") -> dict[str, Any]:
+    """Parse texts ``name=value`` into the values by name; a dot is part of a name."""
+    return {".".join(path): value for path, value in (parse_assignment(text, example, flag) for text in texts)}
+
+
 def read_assignments(texts: Sequence[str]) -> dict[str, Any]:
     """Parse the texts of ``--set name=value`` into a layer of settings.
 

@@ -55,13 +55,12 @@ def _network(config: ExportConfig, kind: str, path: Path) -> Exported:
     """A policy of LeRobot, or an ONNX file that is described."""
     from bam_envs.core.registry import resolve_id
     from bam_train.compat.foreign_export import export_foreign
-    from bam_train.settings import parse_assignment, read_env_kwargs
+    from bam_train.settings import read_env_kwargs, read_named
 
     if kind == "lerobot":
         from bam_train.compat.lerobot_folder import lerobot_policy
 
-        asked = [parse_assignment(text, "steps=20", "--chunk") for text in config.chunk]
-        options: Any = {"chunk": {".".join(name): value for name, value in asked}, "task": config.task}
+        options: Any = {"chunk": read_named(config.chunk, "steps=20", "--chunk"), "task": config.task}
         policy = lerobot_policy(path, data=config.data, units=config.units, served=config.served, **options)
     else:
         from bam_train.compat.foreign_policy import described_policy

@@ -79,10 +79,9 @@ def _consented_env(config: ServeConfig) -> Any:
     from bam_envs.core.registry import MAKE_OPTIONS, resolve_id
     from bam_train.cli.consent import require_consent
     from bam_train.environments import make_env, make_vector_env, require_env_kwargs
-    from bam_train.settings import parse_assignment
+    from bam_train.settings import read_named
 
-    given = [parse_assignment(text, "randomize=true") for text in config.set]
-    env_id, kwargs = resolve_id(config.env), {".".join(path): value for path, value in given}
+    env_id, kwargs = resolve_id(config.env), read_named(config.set, "randomize=true")
     # Options of the place, such as robot=, are allowed here.
     require_env_kwargs(env_id, {name: value for name, value in kwargs.items() if name not in MAKE_OPTIONS})
     many = config.num_envs > 1

@@ -74,10 +74,8 @@ class PlainDisplay:
         """Print the result of an evaluation."""
         success = "" if report.success_rate is None else f"success {percent(report.success_rate)}, "
         rest = f"return {number(report.return_mean)}, {report.length_mean:.0f} steps an episode"
-        newest = ", the best so far" if best else ""
-        self.note(
-            f"evaluation at {count(steps)} steps: {success}{rest} ({counted(report.episodes, 'episode')}){newest}"
-        )
+        rest += f" ({counted(report.episodes, 'episode')}){', the best so far' if best else ''}"
+        self.note(f"evaluation at {count(steps)} steps: {success}{rest}")
 
     def note(self, text: str) -> None:
         """Print a message."""

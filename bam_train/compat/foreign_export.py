@@ -53,10 +53,8 @@ def export_foreign(
         PolicyError: Its graph cannot be used, or does not act as its own library does.
     """
     if policy.network and policy.chunk.overlap is not None:
-        text = (
-            "overlap: its graph makes each chunk by itself; LeRobot's SmolVLA and pi0, which are --served, continue one"
-        )
-        raise PolicyError(f"{policy.place}: {text}")
+        text = "overlap: its graph makes each chunk by itself"
+        raise PolicyError(f"{policy.place}: {text}; LeRobot's SmolVLA and pi0, which are --served, continue one")
     policy = with_known_sizes(policy) if policy.network else policy
     env_kwargs = {**_usual(policy, env_id), **env_kwargs}
     session, frozen, graph, (signals, period) = _joined(policy, env_id, env_kwargs, tell)
@@ -152,8 +150,8 @@ class LibrarySession:
     def run(self, inputs: Mapping[str, Array], _: Sequence[str]) -> list[Array]:
         """The chunk, (1, size, ...), for arrays (1, ...)."""
         ours = {name: (inputs[ours], means) for name, (ours, _, means) in self.taken.items()}
-        ours |= {name: (inputs[name], self.given) for name in inputs if name == LEFT}
-        known = {name: inputs[name] for name in inputs if name == KNOWN}
+        known = {} if self.policy.chunk.overlap is None else {KNOWN: inputs[KNOWN]}
+        ours |= {LEFT: (inputs[LEFT], self.given)} if known else {}
         chunk = np.asarray(self._answer({**as_theirs(self._ports, ours), **known}))
         return [as_ours(self.policy, chunk, self.given, self.shape)[None]]
 
@@ -176,9 +174,8 @@ def _detector(
     policy: ForeignPolicy, taken: Mapping[str, tuple[str, Any, Meaning]], given: Meaning, count: int
 ) -> Detector | None:
     """The detector of unusual observations, of the ranges of the numbers in the data; None if they are not known."""
-    seen = {taken[port.name][0]: port for port in policy.inputs if not port.is_image}
-    found = [(port, *taken[port.name][1:]) for _, port in sorted(seen.items())]
-    ranges = [_range(port, means, math.prod(part.shape)) for port, part, means in found]
+    seen = {taken[port.name][0]: (port, *taken[port.name][1:]) for port in policy.inputs if not port.is_image}
+    ranges = [_range(port, means, math.prod(part.shape)) for _, (port, part, means) in sorted(seen.items())]
     d = sum(len(low) for low, _ in ranges)
     low, high = np.concatenate([*ranges, _range(policy.output, given, count)], axis=1)
     few = 0 < d <= MOST_NUMBERS and len(low) - d <= MOST_NUMBERS

@@ -13,7 +13,6 @@ from dataclasses import asdict
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -59,7 +58,7 @@ def lerobot_policy(
     units: Units | None = None,
     served: bool = False,
     task: str = "",
-    chunk: Mapping[str, Any] = MappingProxyType({}),
+    chunk: Mapping[str, Any] | None = None,
 ) -> ForeignPolicy:
     """The policy in a folder ``pretrained_model``.
 
@@ -86,12 +85,14 @@ def lerobot_policy(
     info, root = _data_set(folder, data)
     ours = DataSet.open(root).info if (root / "meta/bam.json").is_file() else None
     if units is None and ours is None:
-        text = (
-            "its joints may be measured in degrees, or from -100 to 100. Say which: --units degrees, or --units range"
-        )
-        raise SettingsError(f"{folder}: {text}")
+        text = "its joints may be measured in degrees, or from -100 to 100"
+        raise SettingsError(f"{folder}: {text}. Say which: --units degrees, or --units range")
     theirs = {new: old for old, new in renamed.items()}
-    network = _Library(folder, kind, task, theirs, chunk) if served else _Network(folder, kind, chunk)
+    with _reading(folder, kind):
+        network = _Library(folder, kind, task, theirs) if served else _Network(folder, kind)
+    asked = _chunk(folder, network.chunk, chunk or {})
+    if isinstance(network, _Library) and asked.overlap is not None:
+        network.overlap(folder, kind, asked.overlap)
     norms = {name: _norms(folder, found) for name, found in steps.items()}
 
     def port(feature: str, shape: tuple[int, ...], norm: Norm) -> Port:
@@ -104,18 +105,14 @@ def lerobot_policy(
 
     inputs = [port(name, shape, norms["preprocessor"](name, shape)) for name, shape in network.features.items()]
     output = port(_ACTION, network.shape, norms["postprocessor"](_ACTION, network.shape))
-    source: dict[str, Any] = {
-        "directory": str(folder.absolute()),
-        "lerobot": network.version,
-        "data": str(root.absolute()),
-    }
-    source |= {"units": units, "task": task} if served else {}
+    source: dict[str, Any] = {"directory": str(folder.absolute()), "lerobot": network.version}
+    source |= {"data": str(root.absolute())} | ({"units": units, "task": task} if served else {})
     return ForeignPolicy(
         str(folder),
         network.graph(folder),
         tuple(inputs),
         output,
-        network.chunk,
+        asked,
         kind,
         "lerobot",
         1.0 / float(info["fps"]),
@@ -160,15 +157,14 @@ def _reading(folder: Path, kind: str) -> Iterator[None]:
 
 def _loaded(folder: Path, kind: str) -> Any:
     """The policy, as LeRobot makes it."""
-    with _reading(folder, kind):
-        if kind in KINDS:
-            made = getattr(import_module(f"lerobot.policies.{kind}.modeling_{kind}"), KINDS[kind])
-        else:
-            made = import_module("lerobot.policies.factory").get_policy_class(kind)
-        config = import_module("lerobot.configs.policies").PreTrainedConfig.from_pretrained(folder)
-        if kind in KINDS:
-            config.pretrained_backbone_weights = None  # else they are downloaded, and then replaced by its own
-        return made.from_pretrained(folder, config=config)
+    if kind in KINDS:
+        made = getattr(import_module(f"lerobot.policies.{kind}.modeling_{kind}"), KINDS[kind])
+    else:
+        made = import_module("lerobot.policies.factory").get_policy_class(kind)
+    config = import_module("lerobot.configs.policies").PreTrainedConfig.from_pretrained(folder)
+    if kind in KINDS:
+        config.pretrained_backbone_weights = None  # else they are downloaded, and then replaced by its own
+    return made.from_pretrained(folder, config=config)
 
 
 def _features(config: Any) -> dict[str, tuple[int, ...]]:
@@ -185,24 +181,24 @@ class _Library:
     Noise that it draws is the same for each chunk, so that its actions can be compared.
     """
 
-    def __init__(self, folder: Path, kind: str, task: str, theirs: Mapping[str, str], asked: Mapping[str, Any]) -> None:
+    def __init__(self, folder: Path, kind: str, task: str, theirs: Mapping[str, str]) -> None:
         self._policy, self._task, self._theirs = _loaded(folder, kind).eval(), task, theirs
         config, self.version = self._policy.config, version("lerobot")
         own = {"device_processor": {"device": str(config.device)}}
         make = import_module("lerobot.policies.factory").make_pre_post_processors
-        with _reading(folder, kind):
-            self._before, self._after = make(config, pretrained_path=str(folder), preprocessor_overrides=own)
+        self._before, self._after = make(config, pretrained_path=str(folder), preprocessor_overrides=own)
         self.features, self.shape = _features(config), tuple(config.action_feature.shape)
         ensemble = getattr(config, "temporal_ensemble_coeff", None)
-        self.chunk = _chunk(folder, Chunk(config.chunk_size, config.n_action_steps, 1, ensemble), asked)
-        if self.chunk.overlap is not None:
-            if not hasattr(self._policy, "init_rtc_processor"):
-                raise CheckpointMismatch(
-                    folder, f"overlap: {kind} makes each chunk by itself; SmolVLA and pi0 continue one"
-                )
-            rtc: Any = import_module("lerobot.policies.rtc.configuration_rtc")
-            config.rtc_config = rtc.RTCConfig(enabled=True, execution_horizon=self.chunk.overlap)
-            self._policy.init_rtc_processor()
+        self.chunk = Chunk(config.chunk_size, config.n_action_steps, 1, ensemble)
+
+    def overlap(self, folder: Path, kind: str, steps: int) -> None:
+        """Let chunks continue the one before for so many steps; CheckpointMismatch if its kind cannot."""
+        if not hasattr(self._policy, "init_rtc_processor"):
+            text = f"overlap: {kind} makes each chunk by itself; SmolVLA and pi0 continue one"
+            raise CheckpointMismatch(folder, text)
+        rtc: Any = import_module("lerobot.policies.rtc.configuration_rtc")
+        self._policy.config.rtc_config = rtc.RTCConfig(enabled=True, execution_horizon=steps)
+        self._policy.init_rtc_processor()
 
     def graph(self, folder: Path) -> bytes:
         """None: LeRobot computes."""
@@ -239,7 +235,7 @@ class _CenterCrop(Layer):
 class _Network(Layer):
     """LeRobot's network, from normalised features to a chunk of normalised actions; Diffusion begins at fixed noise."""
 
-    def __init__(self, folder: Path, kind: str, asked: Mapping[str, Any]) -> None:
+    def __init__(self, folder: Path, kind: str) -> None:
         super().__init__()
         policy = _loaded(folder, kind)
         config, self.version = policy.config, version("lerobot")
@@ -256,7 +252,6 @@ class _Network(Layer):
                 if hasattr(part, "center_crop"):
                     part.center_crop = _CenterCrop(part.center_crop.size)
             self.noise = torch.randn(1, config.horizon, *self.shape, generator=torch.Generator().manual_seed(0))
-        self.chunk = _chunk(folder, self.chunk, asked)
         self.eval()
 
     def graph(self, folder: Path) -> bytes:
@@ -295,12 +290,10 @@ def _chunk(folder: Path, own: Chunk, asked: Mapping[str, Any]) -> Chunk:
     """A policy's own `Chunk` with what is asked for otherwise."""
     try:
         chunk = read_table(Chunk, {**asdict(own), **asked}, "--chunk")
+        if (chunk.size, chunk.history) != (own.size, own.history):
+            raise ValueError(f"--chunk: its size is {own.size}, and its history {own.history}; leave these out")
     except ValueError as error:
         raise SettingsError(f"{folder}: {error}") from error
-    if (chunk.size, chunk.history) != (own.size, own.history):
-        raise SettingsError(
-            f"{folder}: --chunk: its size is {own.size}, and its history {own.history}; leave these out"
-        )
     return chunk
 
 
@@ -322,10 +315,8 @@ def _norms(folder: Path, steps: list[dict[str, Any]]) -> Any:
             if mode not in _BY:
                 raise CheckpointMismatch(folder, f"normalises {feature} by {mode}, which is not known here")
             if missing := [key for key in _BY[mode] if key not in numbers]:
-                text = (
-                    f"{feature} is normalised by its {' and '.join(missing)}, missing in {file}. Copy the folder whole"
-                )
-                raise CheckpointError(folder, f"{text}, or save the policy again", member=file)
+                text = f"{feature} is normalised by its {' and '.join(missing)}, missing in {file}"
+                raise CheckpointError(folder, f"{text}. Copy the folder whole, or save the policy again", member=file)
             eps, (low, high) = float(config["eps"]), (numbers[key] for key in _BY[mode])
             if mode == "MEAN_STD":
                 mean, std = low, high + (0.0 if feature == _ACTION else eps)
@@ -376,9 +367,8 @@ def _names(folder: Path, info: Mapping[str, Any], feature: str) -> tuple[str, ..
     names = info["features"].get(feature, {}).get("names")
     names = next(iter(names.values())) if isinstance(names, dict) else names  # {"motors": [...]} in older ones
     if not names:
-        raise CheckpointMismatch(
-            folder, f"the data set has no names for the numbers of {feature}: which joints are they?"
-        )
+        text = f"the data set has no names for the numbers of {feature}: which joints are they?"
+        raise CheckpointMismatch(folder, text)
     return tuple(map(str, names))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -14,21 +13,7 @@ import numpy as np
 from bam_envs.core.wording import brief
 from bam_train.data.data_set import DataSet
 from bam_train.data.file_pair import Columns, Head, kind_of
-from bam_train.data.layout import (
-    BAM,
-    COPIES,
-    DATA,
-    DEFAULTS,
-    EPISODES,
-    INFO,
-    STATE,
-    STATE_ALONE,
-    STATS,
-    TASKS,
-    Files,
-    WriterLock,
-    file_name,
-)
+from bam_train.data.layout import BAM, DEFAULTS, INFO, NUMBERED, REPLACED, STATES, Files, WriterLock, file_name
 from bam_train.data.mending import mend
 from bam_train.data.recorded_episode import Array, DataSetInfo, Episode, Leaf, digest_of
 from bam_train.environments import first_difference
@@ -41,7 +26,6 @@ if TYPE_CHECKING:
 
 _OF_FILES = (".mcap", ".txt", ".json", ".csv", ".zip", ".parquet", ".h5", ".hdf5", ".gif", ".mp4", ".png", ".jpg")
 """Suffixes of files; no folder of such a name is made."""
-_NUMBERED, _REPLACED = (DATA, EPISODES, COPIES), (INFO, STATS, TASKS, BAM)
 
 
 class DataSetWriter:
@@ -74,7 +58,8 @@ class DataSetWriter:
         import pyarrow  # noqa: F401 - it writes the episodes, and without it nothing must be made
 
         self._files, self.info = Files(place), info
-        if (suffix := self._files.root.suffix.lower()) in _OF_FILES and not self._files.root.exists():
+        self._is_new = not self._files.root.exists()
+        if self._is_new and (suffix := self._files.root.suffix.lower()) in _OF_FILES:
             raise BadDataSet(f"{place}: is named as a file, and a data set is a folder; leave {suffix} out")
         self._together, self._flush_episodes, self._flush_bytes = together, flush_episodes, flush_bytes
         self._observation, self._action = info.observation_leaves, info.action_leaves
@@ -89,15 +74,13 @@ class DataSetWriter:
             self.undo()
             raise
         self._counted = self._head
-        if not together:
-            self._before = {}
 
     def _open(self) -> None:
         files = self._files
         if not files.exists(INFO):
-            if any(files.numbers(kind) for kind in _NUMBERED):
+            if any(files.numbers(kind) for kind in NUMBERED):
                 raise files.damaged(f"{INFO} is missing")
-            self._head, self._before = Head(self.info, {}), dict.fromkeys(_REPLACED)
+            self._head, self._before = Head(self.info, {}), dict.fromkeys(REPLACED)
             files.write_json(BAM, self._head.own())
             self._head.write(files)
             return
@@ -107,7 +90,7 @@ class DataSetWriter:
             stats = old.stats()
         except BadDataSet:
             stats = None
-        if stats is None or any(files.exists(file_name(kind, old.next_file)) for kind in _NUMBERED):
+        if stats is None or any(files.exists(file_name(kind, old.next_file)) for kind in NUMBERED):
             if lost := mend(files).lost:  # else a writer was killed
                 raise files.damaged(f"is damaged: {lost[0]}")
             old = DataSet.open(files.text)
@@ -173,7 +156,7 @@ class DataSetWriter:
     def _extra_column(self, name: str, values: Any, steps: int) -> Array:
         array = np.asarray(values)
         found = kind_of(array)
-        taken = name.startswith(("observation.", "action", "next.", "bam")) and name not in (STATE, STATE_ALONE)
+        taken = name.startswith(("observation.", "action", "next.", "bam")) and name not in STATES
         if "/" in name or name in DEFAULTS or taken or name in {one.column for one in self._observation}:
             raise BadDataSet(f"{self._files.text}: a column cannot be called {name!r}; choose another name")
         if array.shape[:1] != (steps,):
@@ -210,6 +193,7 @@ class DataSetWriter:
             kept, lost = (counted(one, "whole episode") for one in (self._head.episodes, len(self._waiting)))
             raise OutputError(f"{error}. Kept in {self._files.text}: {kept}; not written: {lost}") from error
         self._head, self._waiting, self._bytes = head, [], 0
+        self._before = self._before if self._together else {}
 
     def commit(self) -> None:
         """Flush, and let what was added `together` count; until it is closed, `undo` takes it back."""
@@ -219,7 +203,10 @@ class DataSetWriter:
             self._counted = self._head
 
     def undo(self) -> None:
-        """Take back what was added `together`, and let others write; a data set that was made is removed."""
+        """Take back what was added `together`, or since the last flush, and let others write.
+
+        A data set that was made for it is removed.
+        """
         if not self._lock.is_held:
             return
         try:
@@ -228,25 +215,20 @@ class DataSetWriter:
         finally:
             self._lock.release()
         if self._before.get(INFO, b"") is None:
-            self._files.remove_empty()
+            self._files.remove_empty(is_new=self._is_new)
 
     def _remember(self) -> None:
         self._first = self._head.file
-        self._before = {name: self._files.content(name) for name in _REPLACED}
+        self._before = {name: self._files.content(name) for name in REPLACED}
 
     def _take_back(self) -> None:
-        self._put_back(INFO)  # first: it counts the other files
-        for number, kind in itertools.product(range(self._first, self._head.file + 1), _NUMBERED):
-            self._files.delete(file_name(kind, number))
-        for name in _REPLACED:
-            self._put_back(name)
-
-    def _put_back(self, name: str) -> None:
-        content = self._before[name]
-        if content is None:
-            self._files.delete(name)
-        elif content != self._files.content(name):
-            self._files.write(name, content)
+        added = [file_name(kind, number) for number in range(self._first, self._head.file + 1) for kind in NUMBERED]
+        for name in (INFO, *added, *REPLACED):  # first what counts the others, and room is made before more is written
+            content = self._before.get(name)
+            if content is None:
+                self._files.delete(name)
+            elif content != self._files.content(name):
+                self._files.write(name, content)
 
     def close(self) -> None:
         """Flush, and let others write."""
@@ -254,7 +236,7 @@ class DataSetWriter:
             try:
                 self.commit()
             except BaseException:
-                self.undo() if self._together else self._lock.release()
+                self.undo()
                 raise
             self._lock.release()
 

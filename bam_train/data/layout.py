@@ -46,11 +46,13 @@ INFO, BAM, STATS, TASKS = "meta/info.json", "meta/bam.json", "meta/stats.json", 
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 COPIES = "copies/chunk-{chunk_index:03d}/file-{file_index:03d}.zip"
+NUMBERED, REPLACED = (DATA, EPISODES, COPIES), (INFO, BAM, STATS, TASKS)
+"""What a flush adds, and what it replaces."""
 DEFAULTS = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64"} | {
     "task_index": "int64"
 }
 """Columns that LeRobot needs."""
-STATE, STATE_ALONE = "observation.state", "observation.environment_state"
+STATES = STATE, STATE_ALONE = ("observation.state", "observation.environment_state")
 """What LeRobot's networks call a vector beside images, and one without any."""
 NEXT = ("next.reward", "next.done", "next.terminated", "next.truncated", "next.success")
 FINAL = "bam/final/"
@@ -148,13 +150,12 @@ class Files:
         if self.exists(name):
             (self.root / name).delete()
 
-    def remove_empty(self) -> None:
-        """Remove the folders of a data set that has no file any more."""
-        if self.exists(LOCK):
-            self.delete(LOCK)
+    def remove_empty(self, *, is_new: bool) -> None:
+        """Remove the folders of a data set that has no file any more, and with `is_new` that of them all."""
+        self.delete(LOCK)
         if (root := self.root.local) is not None:
             folders = [root / name for name in ("copies", "data", "meta/episodes", "meta")]
-            for path in [*(chunk for one in folders for chunk in one.glob("chunk-*")), *folders, root]:
+            for path in [*(chunk for one in folders for chunk in one.glob("chunk-*")), *folders, *[root] * is_new]:
                 with contextlib.suppress(OSError):  # it is not there, or not empty
                     path.rmdir()
 

@@ -60,9 +60,7 @@ class _Reader:
 
     def __init__(self, files: Files) -> None:
         self.files = files
-        self.numbers = sorted(
-            {number for kind in (layout.DATA, layout.EPISODES, layout.COPIES) for number in files.numbers(kind)}
-        )
+        self.numbers = sorted({number for kind in layout.NUMBERED for number in files.numbers(kind)})
         self.is_cut_off = files.exists(layout.MENDING)
         """Whether a mending was cut off, which has left some episodes twice."""
         own, self.problems = self._bam_json()
@@ -154,7 +152,7 @@ def _look(reader: _Reader) -> tuple[Found, set[int]]:
         found.problems += _problems(pair, columns, head)
         for row, one in zip(pair.rows, columns, strict=True):
             found.notes += _odd(row["episode_index"], one.episode)
-            if "lost" in one.episode.facts and all(row is not other for other, _ in pair.lost):
+            if "lost" in one.episode.facts and row not in (other for other, _ in pair.lost):
                 given_up.append((name, row, one.episode.facts["lost"]))
             new = [column for column in one.episode.columns if column not in known]
             found.notes += [f"column {column} is not described in {layout.BAM}; it is kept" for column in new]
@@ -332,7 +330,7 @@ def mend(files: Files, *, accept_loss: bool = False) -> Found:
                 found.set_aside += files.copy_aside(file_name(kind, pair.number), ASIDE)
         if columns and pair.number not in left_over:
             head.write_pair(files, columns)
-    for number, kind in itertools.product(reversed(reader.numbers), (layout.DATA, layout.EPISODES, layout.COPIES)):
+    for number, kind in itertools.product(reversed(reader.numbers), layout.NUMBERED):
         if number >= head.file:
             files.delete(file_name(kind, number))
     files.write_json(layout.BAM, head.own())

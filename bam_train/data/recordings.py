@@ -97,11 +97,9 @@ def info_of_rows(source: Path, env: str | None, env_kwargs: Mapping[str, Any]) -
     return info
 
 
-def add_recording(
-    recording: Recording, place: str | Path | Place, info: DataSetInfo, **options: Any
-) -> tuple[int, list[str]]:
+def add_recording(recording: Recording, place: str | Path | Place, info: DataSetInfo) -> tuple[int, list[str]]:
     """Add the episodes of a recording to a data set, as `add_episodes`."""
-    return add_episodes(recording.path, episodes_of(recording, info), place, info, **options)
+    return add_episodes(recording.path, episodes_of(recording, info), place, info)
 
 
 def add_episodes(
@@ -147,10 +145,8 @@ def add_episodes(
             note = note if len(episode) else "left out: it has no step"
             key = _in_rows(episode, info) if is_rows(source) else (episode.facts["recording"], episode.facts["number"])
             is_there, there[key] = not again and there[key] > 0, there[key] - 1
-            for text in (
-                note,
-                f"is in {place} already; bam-data import --again adds it all the same" if is_there else "",
-            ):
+            repeated = f"is in {place} already; bam-data import --again adds it all the same" if is_there else ""
+            for text in (note, repeated):
                 notes.setdefault(text, []).append(episode.facts["number"])
             is_whole = "left out" not in note
             count += is_whole
@@ -223,7 +219,7 @@ def _in_rows(episode: Episode, info: DataSetInfo) -> str:
     )
 
 
-def episodes_of_rows(source: Path, info: DataSetInfo) -> list[tuple[Episode, str]]:
+def episodes_of_rows(source: Path, info: DataSetInfo) -> Iterator[tuple[Episode, str]]:
     """Each episode of a Parquet file or a folder of them, and what is odd about it.
 
     The rows of an episode follow each other, also from one file to the next; it ends where it terminates, is truncated,
@@ -241,7 +237,6 @@ def episodes_of_rows(source: Path, info: DataSetInfo) -> list[tuple[Episode, str
     rows = {name: _numbers(f"{source}: {name}", table[name].combine_chunks(), *kind) for name, kind in kinds.items()}
     ids, ends = table["eps_id"].to_pylist(), rows["terminateds"] | rows["truncateds"]
     starts = [0, *(k for k in range(1, len(ids)) if ends[k - 1] or ids[k] != ids[k - 1]), len(ids)]
-    found: list[tuple[Episode, str]] = []
     cut_off: set[Any] = set()
     for number, (start, stop) in enumerate(pairwise(starts)):
         observations = np.concatenate([rows["obs"][start:stop], rows["new_obs"][stop - 1 : stop]])
@@ -255,8 +250,7 @@ def episodes_of_rows(source: Path, info: DataSetInfo) -> list[tuple[Episode, str
             cut_off.add(ids[start])
         actions, rewards = rows["actions"][start:stop], rows["rewards"][start:stop]
         episode = Episode(observations, actions, rewards, *end, facts=facts)
-        found.append((episode, "" if ends[stop - 1] else _NO_END))
-    return found
+        yield episode, "" if ends[stop - 1] else _NO_END
 
 
 def _rows(source: Path, columns: list[str]) -> Arrow:

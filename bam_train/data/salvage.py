@@ -151,9 +151,8 @@ def _episode(
     if not {*observed, *acted, layout.NEXT[0]} <= {*steps.column_names} or not len(steps):
         return None
     known, lost = dict(row), []
-    if {*layout.LIGHT} <= row.keys() and row_digest(row) != row.get(
-        layout.ROW, row_digest(row)
-    ):  # one of its values is wrong
+    if {*layout.LIGHT} <= row.keys() and row_digest(row) != row.get(layout.ROW, row_digest(row)):
+        # One of its values is wrong.
         known = {name: row[name] for name in ("episode_index", "bam/digest", *_ENDS)}
     here = [name for name in data.extra if name in steps.column_names and not steps[name].null_count]
     own = json.loads(known.get("bam/columns", json.dumps(here)))
@@ -181,15 +180,15 @@ def _episode(
     tries = [(kept, digests[layout.EXTRA], "")] + ([([], None, "further columns")] if digests[layout.EXTRA] else [])
     for (names, extra, missing), end in itertools.product(tries, itertools.product(*ends)):
         full = {"episode_index": number, **known, **digests, layout.EXTRA: extra, **dict(zip(_ENDS, end, strict=True))}
-        every = " and ".join([*lost, *([missing] if missing else [])])
-        all_lost = " and ".join(filter(None, [str(facts.get("lost", "")), every]))  # earlier ones, which were given up
-        told = {**facts, "lost": all_lost} if all_lost else facts
+        now = " and ".join(filter(None, [*lost, missing]))
+        ever = " and ".join(filter(None, [str(facts.get("lost", "")), now]))  # with what was given up before
+        told = facts | ({"lost": ever} if ever else {})
         full |= {"bam/facts": json.dumps(told), "bam/columns": json.dumps(names)}
         try:
             found = data.read(full, steps.drop_columns([one for one in here if one not in names]), last)
         except layout.UNREADABLE:
             continue
-        return found, full | {"bam/digest": found.digest}, every
+        return found, full | {"bam/digest": found.digest}, now
     return None
 
 

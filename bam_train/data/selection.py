@@ -14,7 +14,6 @@ from typing import Any
 from bam_envs.core.wording import did_you_mean
 from bam_train.data.data_set import DataSet
 from bam_train.data.data_set_writer import DataSetWriter, require_same
-from bam_train.data.recordings import require_addable
 from bam_train.errors import BadDataSet, SettingsError
 
 _Sources = Sequence[tuple[DataSet, Sequence[int]]]
@@ -101,8 +100,6 @@ def copy_episodes(data: DataSet, parts: Mapping[str, Sequence[int]]) -> list[tup
         BadDataSet: One of the places does not take them.
         OutputError: One cannot be written. After any exception, all places are as they were.
     """
-    for out in parts:
-        require_addable(out, data.info)
     return _copy({out: [(data, indices)] for out, indices in parts.items()})
 
 
@@ -129,9 +126,10 @@ def split(data: DataSet, share: float, by: str | None = None) -> tuple[list[int]
 
 def _copy(parts: Mapping[Any, _Sources]) -> list[tuple[int, int]]:
     """Add episodes of other data sets to each place, to all of them or to none; returns for each as `merge`."""
-    for out, sources in parts.items():
-        for one, _ in sources:
-            _require_other(one, out)
+    for out, (one, _) in [(out, source) for out, sources in parts.items() for source in sources]:
+        a, b = Path(one.place).expanduser(), Path(out).expanduser()
+        if one.place == str(out) or (a.exists() and b.exists() and a.samefile(b)):
+            raise BadDataSet(f"{out}: is read and cannot be written too; choose another place")
     with contextlib.ExitStack() as stack:
         writers = [
             stack.enter_context(DataSetWriter(out, sources[0][0].info, together=True)) for out, sources in parts.items()
@@ -151,9 +149,3 @@ def _add(writer: DataSetWriter, out: str | Path, sources: _Sources) -> tuple[int
                 writer.add(episode)
                 added += 1
     return added, sum(len(indices) for _, indices in sources) - added
-
-
-def _require_other(data: DataSet, out: str | Path) -> None:
-    a, b = Path(data.place).expanduser(), Path(out).expanduser()
-    if data.place == str(out) or (a.exists() and b.exists() and a.samefile(b)):
-        raise BadDataSet(f"{out}: is read and cannot be written too; choose another place")

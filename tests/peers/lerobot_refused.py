@@ -17,54 +17,33 @@ from bam_train.cli.export import main
 
 made, copies = Path(sys.argv[1]), Path(sys.argv[2])
 STATE, FLAGS = "observation.state", ("--robot-model", "so101", "--units", "degrees")
-NORMALIZER = "policy_preprocessor_step_3_normalizer_processor.safetensors"
+BEFORE, NORMALIZER = "policy_preprocessor.json", "policy_preprocessor_step_3_normalizer_processor.safetensors"
 
 
-def config(**changes):
-    """Change the policy's config.json."""
-    return lambda folder: edit(folder / "config.json", lambda text: json.dumps(json.loads(text) | changes))
-
-
-def edit(path, change):
-    path.write_text(change(path.read_text()))
-
-
-def without(*names):
-    """Leave statistics out."""
+def replaced(name, *change):
+    """Replace text in a file."""
 
     def damage(folder):
-        arrays = load_file(folder / NORMALIZER)
-        save_file({name: one for name, one in arrays.items() if name not in names}, folder / NORMALIZER)
+        (folder / name).write_text((folder / name).read_text().replace(*change))
 
     return damage
 
 
-def without_state(folder):
-    """As of a normaliser that was never given statistics."""
-
-    def change(text):
-        steps = json.loads(text)
-        steps["steps"][3].pop("state_file")
-        return json.dumps(steps)
-
-    edit(folder / "policy_preprocessor.json", change)
+def without_mean(folder):
+    arrays = load_file(folder / NORMALIZER)
+    save_file({name: one for name, one in arrays.items() if name != f"{STATE}.mean"}, folder / NORMALIZER)
 
 
 DAMAGES = {
-    "no processors": lambda folder: (folder / "policy_preprocessor.json").unlink(),
-    "unknown step": lambda folder: edit(
-        folder / "policy_preprocessor.json", lambda text: text.replace("to_batch_processor", "delta_action_processor")
-    ),
+    "no processors": lambda folder: (folder / BEFORE).unlink(),
+    "unknown step": replaced(BEFORE, "to_batch_processor", "delta_action_processor"),
     "no file of statistics": lambda folder: (folder / NORMALIZER).unlink(),
-    "no statistics": without_state,
-    "no mean": without(f"{STATE}.mean"),
-    "none of an input": without(*(f"{STATE}.{one}" for one in ("mean", "std", "min", "max"))),
-    "another version": config(attention_of_tomorrow=True),
-    "another size": config(dim_model=64),
-    "chunk of zero": config(chunk_size=0, n_action_steps=0),
-    "no weights": lambda folder: (folder / "model.safetensors").unlink(),
+    "no statistics": replaced(BEFORE, '"state_file"', '"no_file"'),  # as of a normaliser that was never given any
+    "no mean": without_mean,
+    "another version": replaced("config.json", "{", '{"attention_of_tomorrow": true, ', 1),
+    "another size": replaced("config.json", '"dim_model": 32', '"dim_model": 64'),
     "cut weights": lambda folder: (folder / "model.safetensors").write_bytes(b"\x10\0\0"),
-    "no steps": lambda folder: (folder / "policy_preprocessor.json").write_text("{}"),
+    "no steps": lambda folder: (folder / BEFORE).write_text("{}"),
 }
 CHUNKS = ("size=5", "steps=9", "ensemble=much", "stpes=4", "overlap=4")
 

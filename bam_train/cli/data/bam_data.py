@@ -71,11 +71,8 @@ def collect(config: flags.CollectConfig) -> None:
         return
     if found.repeated:
         say(f"bam-data: note: {found.repeated} of them were in {config.place} already: another --seed gives others")
-    share = percent(found.successes / found.episodes)
-    tell(
-        f"{config.place}: {counted(found.episodes, 'episode')}, {counted(found.steps, 'step')} added; {share} of "
-        "them succeeded"
-    )
+    added = f"{counted(found.episodes, 'episode')}, {counted(found.steps, 'step')} added"
+    tell(f"{config.place}: {added}; {percent(found.successes / found.episodes)} of them succeeded")
 
 
 def import_(config: flags.ImportConfig) -> None:
@@ -95,20 +92,19 @@ def import_(config: flags.ImportConfig) -> None:
     for path in config.recordings:
         if rosbags.is_bag(path):
             info = rosbags.info_of_bag(env_kwargs)
-            parts = rosbags.episodes_of_bag(path, info, config.profile)
-            found, notes = recordings.add_episodes(path, parts, config.place, info, **options)
+            episodes = rosbags.episodes_of_bag(path, info, config.profile)
         elif recordings.is_rows(path):
             if os.path.abspath(Place(path).path) == os.path.abspath(Place(config.place).path):
                 raise SettingsError(f"{config.place}: has the Parquet rows; give another PLACE for the data set")
             info = recordings.info_of_rows(path, config.env, env_kwargs)
             episodes = recordings.episodes_of_rows(path, info)
-            found, notes = recordings.add_episodes(path, episodes, config.place, info, **options)
         else:
             recording = Recording.open(path)
             if env_kwargs:
                 raise SettingsError(f"--set: {path} says the arguments of its environment; leave --set out")
             info = recordings.info_of_recording(recording, config.env)
-            found, notes = recordings.add_recording(recording, config.place, info, **options)
+            episodes = recordings.episodes_of(recording, info)
+        found, notes = recordings.add_episodes(path, episodes, config.place, info, **options)
         if not found:
             why = "".join(f"; {note.removeprefix(f'{path}: ')}" for note in notes)
             raise BadDataSet(f"{path}: has no whole episode{why}. Leave it out")
@@ -193,17 +189,11 @@ def show_info(config: flags.InfoConfig) -> None:
         ("tasks", "; ".join(data.tasks)),
         ("policies", ", ".join(f"{name[:12]} ({times})" for name, times in policies.items()) or "not known"),
         ("recorded", " to ".join(dict.fromkeys((dates[0], dates[-1]))) if dates else "not known"),
-        *(
-            ("lost", f"{what} of {counted(times, 'episode')}, given up with --accept-loss")
-            for what, times in lost.items()
-        ),
+        *(("lost", f"{what} of {counted(n, 'episode')}, given up with --accept-loss") for what, n in lost.items()),
         ("digest", data.digest),
     ]
-    steps = data.total_frames
-    tell(
-        f"{config.place}: {counted(len(data), 'episode')}, {count(steps)} steps, {duration(steps * info.period)} of "
-        "the task"
-    )
+    steps, episodes = data.total_frames, counted(len(data), "episode")
+    tell(f"{config.place}: {episodes}, {count(steps)} steps, {duration(steps * info.period)} of the task")
     for row in found:
         tell(f"  {'success':<12}{_success(row)}; mean return {number(row['mean_return'])}")
     tell(*(f"  {name:<12}{text}" for name, text in lines))
@@ -288,10 +278,8 @@ def show_episode(config: flags.ShowConfig) -> None:
             add(frame)
     end = {True: "success", False: "failure", None: "success not known"}[facts["success"]]
     end += f"; lost: {facts['lost']}" if "lost" in facts else ""
-    tell(
-        f"{path}: episode {config.episode % len(data)}, {counted(pictures, 'picture')}, return "
-        f"{facts['return']:.4g}, {end}"
-    )
+    drawn = f"episode {config.episode % len(data)}, {counted(pictures, 'picture')}"
+    tell(f"{path}: {drawn}, return {facts['return']:.4g}, {end}")
 
 
 def _require(given: Sequence[object], what: str) -> None:

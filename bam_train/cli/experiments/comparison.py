@@ -277,14 +277,14 @@ class RunComparison:
         Raises:
             SettingsError: It is no rule, or a row has no interval.
         """
-        kind, _, number = rule.partition(":")
+        kind, _, least = rule.partition(":")
         if kind not in RULES:
             raise SettingsError(f"--fail-if: there is no rule {kind!r}. {did_you_mean(kind, RULES)}")
         if re.fullmatch(rf"{kind}(:\d+(\.\d+)?)?", rule) is None:
             raise SettingsError(f"--fail-if: expected a margin as in {kind}:0.05, found {rule!r}")
         if len(self.rows) < 2:
             raise SettingsError("--fail-if compares with the first FOLDER; give another one too")
-        margin, lines = float(number or 0), []
+        margin, lines = float(least or 0), []
         for found in self.found[1:]:
             less = found.difference
             if less is None or less.low is None or less.high is None:

@@ -33,7 +33,7 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
     from bam_train.checkpoint import Checkpoint
     from bam_train.deploy.deployment import Stopped
     from bam_train.environments import environment_of
-    from bam_train.settings import parse_assignment
+    from bam_train.settings import read_named
     from bam_train.signals import handled
 
     if config.record is not None:
@@ -55,10 +55,8 @@ def run_agent(config: AgentConfig, signals: SignalMemory) -> int:
         active = versions.first(config.policy)
         env_id, env_kwargs = environment_of(Checkpoint.open(active.path), config.env)
         if config.robot is None:
-            given = {
-                ".".join(path): value for path, value in (parse_assignment(one, "randomize=true") for one in config.set)
-            }
-            box = SimulatedBox(env_id, {**env_kwargs, **given}, options.robot.robot_name)
+            kwargs = {**env_kwargs, **read_named(config.set, "randomize=true")}
+            box = SimulatedBox(env_id, kwargs, options.robot.robot_name)
             stack.callback(box.close)
             box.start()
             options = replace(options, robot=replace(options.robot, url=box.url))

@@ -163,11 +163,9 @@ class LiveSession:
             self._still, figures = "", self.learner.statistics()
             rate = figures["success_rate"]
             shown = "unknown" if rate is None else f"{rate:.0%}"
-            self._tell(
-                f"{counted(self.learner.steps, 'step')} ({figures['interventions']} of a person), "
-                f"{counted(figures['episodes'], 'episode')}, {counted(figures['updates'], 'update')}; success of the "
-                f"last episodes {shown}"
-            )
+            steps = f"{counted(self.learner.steps, 'step')} ({figures['interventions']} of a person)"
+            done = f"{counted(figures['episodes'], 'episode')}, {counted(figures['updates'], 'update')}"
+            self._tell(f"{steps}, {done}; success of the last episodes {shown}")
 
     def _tell_why(self) -> None:
         """Tell, once, why no steps come."""

@@ -1,10 +1,13 @@
 """Spaces of every kind, and episodes of random numbers in them."""
 
+import itertools
+
 import gymnasium as gym
 import numpy as np
 
 from bam_envs.core.spaces import mapped
 from bam_train.data import DataSetInfo, DataSetWriter, Episode
+from bam_train.data.layout import Files
 
 SPACES = {
     "box": gym.spaces.Box(-np.inf, np.inf, (3,), np.float32),
@@ -50,3 +53,15 @@ def episode(info, steps, seed=0, **changes):
 def write(place, info, episodes, **options):
     with DataSetWriter(place, info, **options) as writer:
         return [writer.add(one) for one in episodes]
+
+
+def fails_at(number, error):
+    """`Files.write` that raises this error at its call of this number, counted from 1."""
+    write_file, calls = Files.write, itertools.count(1)
+
+    def write_some(self, name, content):
+        if next(calls) == number:
+            raise error
+        write_file(self, name, content)
+
+    return write_some

@@ -11,7 +11,7 @@ from bam_train.data import DataSet, DataSetWriter
 from bam_train.data.layout import Files
 from bam_train.data.mending import look
 from bam_train.errors import BadDataSet, OutputError, PlaceError
-from tests.bam_train.data.episode_samples import SPACES, episode, info_of, write
+from tests.bam_train.data.episode_samples import SPACES, episode, fails_at, info_of, write
 
 pytest.importorskip("pyarrow")
 
@@ -112,24 +112,26 @@ def test_a_second_writer_hears_who_is_first(tmp_path):
         assert writer.add(episode(info_of(), 2)) == 1
 
 
+def test_undo_takes_back_what_is_not_flushed(tmp_path):
+    with DataSetWriter(tmp_path / "d", info_of()) as writer:
+        writer.add(episode(info_of(), 2, 0))
+        writer.flush()
+        writer.add(episode(info_of(), 2, 1))
+        writer.undo()
+    assert [one.facts["seed"] for one in DataSet.open(tmp_path / "d")] == [0]
+
+
 def test_a_full_disk_says_what_is_kept_and_the_rest_is_written_once_there_is_room(tmp_path, monkeypatch):
     """Every write of a flush can fail."""
-    write_file, info = Files.write, info_of()
+    info = info_of()
     full = r"^{0}/\S+: no space\. Kept in {0}: 2 whole episodes; not written: 1 whole episode$"
     for count in range(1, 8):
-        left, place = [count], tmp_path / f"d{count}"
-
-        def write_some(self, name, content, left=left, place=place):
-            left[0] -= 1
-            if not left[0]:
-                raise PlaceError(place / name, "no space")
-            write_file(self, name, content)
-
+        place = tmp_path / f"d{count}"
         with DataSetWriter(place, info, flush_episodes=2) as writer:
             for seed in range(3):
                 writer.add(episode(info, 2, seed))
             with monkeypatch.context() as patch:
-                patch.setattr(Files, "write", write_some)
+                patch.setattr(Files, "write", fails_at(count, PlaceError(place / "a", "no space")))
                 with pytest.raises(OutputError, match=full.format(place)):
                     writer.flush()
             assert len(DataSet.open(place)) == 2

@@ -16,7 +16,7 @@ from bam_train.data import DataSet, DataSetWriter
 from bam_train.data.layout import Files
 from bam_train.data.mending import look, mend
 from bam_train.errors import BadDataSet
-from tests.bam_train.data.episode_samples import episode, info_of, write
+from tests.bam_train.data.episode_samples import episode, fails_at, info_of, write
 
 pytest.importorskip("pyarrow")
 ROOT = Path(__file__).parents[3]
@@ -334,23 +334,15 @@ def test_a_mending_that_was_cut_off_goes_on(place, monkeypatch):
     """Every write of it can be the last one."""
     (place / DATA.format("000")).unlink()
     damaged, done = contents(place), False
-    write_file, count = Files.write, 0
+    count = 0
     while not done:
         count += 1
-        left = [count]
-
-        def write_some(self, name, content, left=left):
-            left[0] -= 1
-            if left[0] < 0:
-                raise KeyboardInterrupt
-            write_file(self, name, content)
-
         shutil.rmtree(place)
         for one, right in damaged.items():
             (place / one).parent.mkdir(parents=True, exist_ok=True)
             (place / one).write_bytes(right)
         with monkeypatch.context() as patch:
-            patch.setattr(Files, "write", write_some)
+            patch.setattr(Files, "write", fails_at(count, KeyboardInterrupt))
             try:
                 mend(Files(place), accept_loss=True)
                 done = True

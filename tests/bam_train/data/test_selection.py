@@ -9,6 +9,7 @@ from bam_train.data import DataSet, DataSetInfo, DataSetWriter
 from bam_train.data.layout import Files
 from bam_train.data.selection import choose, copy_episodes, merge, split
 from bam_train.errors import BadDataSet, PlaceError, SettingsError
+from tests.bam_train.data.episode_samples import fails_at
 from tests.bam_train.data.export.test_export import SPACES, record
 
 
@@ -46,27 +47,20 @@ def test_others_are_not_merged(change, what, tmp_path):
 
 
 def test_a_split_that_is_cut_off_leaves_both_places_as_they_were(tmp_path, monkeypatch):
-    """Every write of it can be the last one: into one place that is new, and one that has episodes."""
+    """Every write of it can be the last one: into a new place, an empty folder, and one that has episodes."""
     data, kept = record(tmp_path / "a", count=9), record(tmp_path / "old", count=2)
-    parts = {str(tmp_path / "new"): [4, 5, 6], kept.place: [2, 3]}
+    parts = {str(tmp_path / "new"): [4, 5, 6], str(tmp_path / "empty"): [7], kept.place: [2, 3]}
+    (tmp_path / "empty").mkdir()
     before = contents(tmp_path)
-    write, count, done = Files.write, 0, False
+    count, done = 0, False
     while not done:
         count += 1
-        left = [count]
-
-        error = (KeyboardInterrupt, PlaceError("disk", "no space"))[count % 2]
-
-        def write_some(self, name, content, left=left, error=error):
-            left[0] -= 1
-            if not left[0]:
-                raise error
-            write(self, name, content)
-
         with monkeypatch.context() as patch:
-            patch.setattr(Files, "write", write_some)
+            patch.setattr(
+                Files, "write", fails_at(count, (KeyboardInterrupt, PlaceError("disk", "no space"))[count % 2])
+            )
             try:
-                assert copy_episodes(data, parts) == [(3, 0), (2, 0)]
+                assert copy_episodes(data, parts) == [(3, 0), (1, 0), (2, 0)]
                 done = True
             except (KeyboardInterrupt, PlaceError):
                 assert contents(tmp_path) == before, count
