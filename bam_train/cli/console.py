@@ -47,10 +47,12 @@ def ask(question: str, write: Callable[[str], None]) -> str:
     What was typed ahead of the question, in lines or in part of one, is thrown away: it answers something else. The
     answer is empty at the end of input, and if the terminal is gone.
     """
-    import termios
-
     try:
+        import termios
+
         termios.tcflush(sys.stdin, termios.TCIFLUSH)
+    except ImportError:  # Windows
+        pass
     except termios.error:  # the terminal is gone
         return ""
     write(question)

@@ -52,8 +52,9 @@ class PlainDeployment:
 
     def judge(self, record: EpisodeRecord) -> bool | None:
         """Ask the operator whether the policy did its task, which the environment does not say; None: no answer."""
+        next_ = "; the next episode begins then" if self._journal.begun < self._journal.wanted else ""
         for _ in range(_ASKED):
-            answer = self._ask(f"Did it do its task in the episode with seed {record.seed}? Type yes or no:")
+            answer = self._ask(f"Did it do its task in the episode with seed {record.seed}? Type yes or no{next_}:")
             if answer in ("yes", "no"):
                 return answer == "yes"
         return None

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from bam_envs.core.timing import Pacer
 from bam_train.cli.deploy_display import LiveDeployment, PlainDeployment, live_display, numbers_of
-from bam_train.deploy.journal import EpisodeRecord, Journal
+from bam_train.deploy.journal import Journal
 
 
 class Panel:
@@ -65,11 +65,14 @@ def test_who_stands_beside_the_robot_is_asked_and_answers_after_the_question(
 ):
     screen = io.StringIO()
     shown = person(screen, typed, ahead="no\nyes\nye")
-    display = PlainDeployment(Journal(1), shown.write)
+    journal = Journal(1 + panel)
+    display, record = PlainDeployment(journal, shown.write), journal.begin(8)
     if panel:
-        display = LiveDeployment(SimpleNamespace(console=Console(file=shown)), gym.make(corridor), "t", Journal(1))
-    assert display.judge(EpisodeRecord(8)) is answer
-    question = "Did it do its task in the episode with seed 8? Type yes or no:"
+        console = Console(file=shown, width=150)
+        display = LiveDeployment(SimpleNamespace(console=console), gym.make(corridor), "t", journal)
+    assert display.judge(record) is answer
+    question = "Did it do its task in the episode with seed 8? Type yes or no"
+    question += "; the next episode begins then:" if panel else ":"
     assert screen.getvalue().count(question) == asked
 
 
