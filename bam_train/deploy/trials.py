@@ -322,6 +322,8 @@ class Trials:
     def __init__(self, record: TrialRecord, subject: Subject, threshold: float, facts: Mapping[str, Any]) -> None:
         self.record, self.subject, self.threshold, self.facts = record, subject, threshold, dict(facts)
         self._running: str | None = None
+        self.begun = 0
+        """Trials that have begun."""
 
     @property
     def evidence(self) -> Evidence:
@@ -340,6 +342,7 @@ class Trials:
     def begin(self, seed: int) -> None:
         """Record the start of a trial; raises FormatError if that fails, and then the robot must not move."""
         self._running = self.record.begin(self.subject, **self.facts, seed=seed)
+        self.begun += 1
 
     def end(self, success: bool, reason: str, *, void: bool = False) -> None:
         """Record the end of the running trial, if there is one; a `void` one does not count."""
