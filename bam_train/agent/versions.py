@@ -70,7 +70,7 @@ class Versions:
         """Within the ``with`` block, no other agent uses the folder; what a killed one left half written is removed.
 
         Raises:
-            OutputError: Another agent uses it.
+            OutputError: Another agent uses it, or the disk is full.
         """
         with self._writing():
             file = _open_lock(self.folder / _HOLDER)
@@ -82,9 +82,9 @@ class Versions:
                 raise OutputError(
                     f"{self.folder}: {other} uses it. End that one, or give another --folder", kind="FolderInUse"
                 ) from error
-            file.truncate(0)
-            file.write(f"{os.getpid()}\n".encode())
-            file.flush()
+            with self._writing():
+                file.truncate(0)
+                os.write(file.fileno(), f"{os.getpid()}\n".encode())  # nothing is left for `close` to write
             for path in self.folder.glob(".*.tmp"):
                 remove_orphans(self.folder / path.name[1:].rsplit(".", 2)[0])
             yield

@@ -205,19 +205,25 @@ class DeployReport:
         ]
 
     def lines(self) -> list[str]:
-        """The report as text, without details of a fault, which were shown when it occurred."""
+        """The report as text, without details of a fault, which were shown when it occurred.
+
+        Before the first episode there are no figures.
+        """
         journal, reason = self.journal, self.ending.reason.partition(":")[0]
         successes = journal.successes
         succeeded = "" if successes is None else f", {successes} success{'' if successes == 1 else 'es'}"
         episodes = f"{journal.completed} of {counted(journal.wanted, 'episode')}{succeeded}"
-        return [
+        figures = [
             f"{reason}: {episodes}, {counted(self.pacer.ticks, 'tick')}, {rate_text(self.pacer)}{journal.marked}",
             *([f"lateness {lateness_text(self.pacer)}"] if self.pacer.period is not None else []),
             *([guards_text(self.guards, self.pacer.ticks)] if self.guards else []),
             *([f"live agent: {guards_text(self.agent_guards, self.pacer.ticks)}"] if self.agent_guards else []),
+        ]
+        return [
+            *(figures if journal.begun else []),
             *([f"the last trial does not count: {one.uncounted}" for one in (self.trials,) if one and one.uncounted]),
-            *([self.trials.evidence.text] if self.trials else []),
-            *([self.shadow.agreement.text] if self.shadow else []),
+            *([self.trials.evidence.text] if self.trials and self.trials.begun else []),
+            *([self.shadow.agreement.text] if self.shadow and journal.begun else []),
             *([recorded_text(self.recorder)] if self.recorder is not None else []),
         ]
 

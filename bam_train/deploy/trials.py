@@ -324,6 +324,8 @@ class Trials:
         self._running: str | None = None
         self.uncounted = ""
         """Why the last trial does not count, in one line; "" if it does."""
+        self.begun = 0
+        """Trials that have begun."""
 
     @property
     def evidence(self) -> Evidence:
@@ -337,6 +339,7 @@ class Trials:
     def begin(self, seed: int) -> None:
         """Record the start of a trial; raises FormatError if that fails, and then the robot must not move."""
         self._running = self.record.begin(self.subject, **self.facts, seed=seed)
+        self.begun += 1
 
     def end(self, success: bool, reason: str, *, void: bool = False) -> None:
         """Record the end of the running trial, if there is one; a `void` one does not count."""

@@ -303,7 +303,8 @@ class AgentClient:
             )
         except InvalidStatus as error:
             status = error.response.status_code
-            refusal = _NO_AGENT if status == 404 else http_refusal(status, bytes(error.response.body or b""))
+            body = bytes(error.response.body or b"")
+            refusal = _NO_AGENT if status == 404 else http_refusal(status, body, endpoint.token)
             raise NoServer(address.url, refusal) from error
         except TimeoutError as error:
             raise NoServer(address.url, silent(address, timeout)) from error

@@ -168,7 +168,8 @@ def _write_measured(config: DoctorConfig, diagnosis: Diagnosis) -> dict[str, Any
     if inspection is None:
         say(f"bam-doctor: {path} was not written: the link was not measured")
         return None
-    about = f"{config.url}, {len(inspection.trips)} pings in {inspection.seconds:.1f} s"
+    busy = f"; {inspection.busy}" if inspection.busy else ""
+    about = f"{config.url}, {len(inspection.trips)} pings in {inspection.seconds:.1f} s{busy}"
     try:
         link = measured_link(inspection.trips, inspection.copies, next(iter(inspection.readings.values())), about)
         with replacing(path) as temporary:
@@ -179,7 +180,10 @@ def _write_measured(config: DoctorConfig, diagnosis: Diagnosis) -> dict[str, Any
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
     if not config.json:
-        tell(f"{path}: the measured link; try it with bam-deploy CHECKPOINT --rehearse {path}")
+        then = (
+            "end other programs, and measure again" if busy else f"try it with bam-deploy CHECKPOINT --rehearse {path}"
+        )
+        tell(f"{path}: the measured link{busy}; {then}")
     return asdict(link)
 
 

@@ -38,7 +38,8 @@ def replay(config: ReplayConfig) -> None:
         facts = {**facts_of(recording), "played": None if played is None else played.to_json(), "not_played": why}
         tell(json_module.dumps(facts, allow_nan=False))
     else:
-        tell(*lines_of(recording), *_played_lines(played, why))
+        chunks = not isinstance(checkpoint, str) and checkpoint.manifest.chunk is not None
+        tell(*lines_of(recording), *_played_lines(played, why, chunks=chunks))
     if picture is not None:
         from bam_train.recording.drawing import plot
 
@@ -82,11 +83,13 @@ def _play(config: ReplayConfig, recording: Recording, checkpoint: Checkpoint) ->
         return play(recording, env, policy, acts=acts)
 
 
-def _played_lines(played: Playback | None, why: str) -> list[str]:
+def _played_lines(played: Playback | None, why: str, *, chunks: bool) -> list[str]:
     if played is None:
         return [f"not played: {why}"]
     lines = [f"played: the same observation in {played.observations} of {counted(played.ticks, 'tick')}, "]
     lines[0] += f"the same action in {played.actions}" + ("" if played.same else f", at most {played.worst:.3g} apart")
+    if chunks and played.actions < played.ticks:
+        lines.append("chunks are computed beside the loop: which one a tick had depends on how long each took")
     if played.others:
         others = ", ".join(f"{name} in {count}" for name, count in played.others.items())
         lines.append(f"not compared: the ticks in which another policy acted: {others}")

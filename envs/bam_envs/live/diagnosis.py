@@ -175,6 +175,8 @@ class Diagnosis:
                     "(--profile); with --checkpoint only those of its task are needed."
                     f"{namespaces_with(link, 'topics', topic, topics)}{self._another_kind(profile)}"
                 )
+        if other := bringup.another_robot(link, self.robot.spec):  # also one with the same topics
+            raise ProtocolError(other)
         found = [f"profile {profile.name}: {', '.join(topics)}"]
         if types.answers:
             off = [f"its lasers are off ({listed(dark)}), as for bam/navigation; bam/avoidance needs them"]

@@ -265,8 +265,12 @@ class RosbridgeLink(RosBus, Ros):  # type: ignore[misc]
     def _take(self, connection: Connection, message: dict[str, Any]) -> None:
         operation, identity = message.get("op"), str(message.get("id"))
         if operation == "publish":
-            self._take_published(message.get("topic"), message.get("msg"))
-            self._emit(message["topic"], message["msg"])
+            self._thread.listens = True
+            try:
+                self._take_published(message.get("topic"), message.get("msg"))
+                self._emit(message["topic"], message["msg"])
+            finally:
+                self._thread.listens = False
         elif operation in ("service_response", "action_result"):
             self._answered(identity, message)
         elif operation == "call_service" and self._up is None and identity in self._waiting:

@@ -22,7 +22,7 @@ from bam_envs.core.errors import BamEnvsError, InvalidValue, LinkLost, NoServer,
 from bam_envs.rosbridge.bus import tell
 from bam_envs.rosbridge.dialing import http_refusal, no_connection, no_websocket, open_port, silent
 from bam_envs.rosbridge.encoding import Fragments, decode_server_frame, dump_json
-from bam_envs.rosbridge.endpoint import Address, Endpoint
+from bam_envs.rosbridge.endpoint import Endpoint
 from bam_envs.rosbridge.ros_bus import bare_reason
 
 TWISTED = (
@@ -297,20 +297,20 @@ async def open_connection(endpoint: Endpoint, timeout: float, max_message: int, 
         ends = [connection.is_open, connection.is_closed]
         await asyncio.wait(ends, timeout=deadline - time.monotonic(), return_when=asyncio.FIRST_COMPLETED)
         if not connection.can_send:
-            raise NoServer(address.url, _no_websocket(address, connection, timeout))
+            raise NoServer(address.url, _no_websocket(endpoint, connection, timeout))
         return connection
     finally:
         if not connection.can_send:
             connection.drop(LinkLost(f"{address.url}: no answer."))
 
 
-def _no_websocket(address: Address, connection: Connection, timeout: float) -> str:
+def _no_websocket(endpoint: Endpoint, connection: Connection, timeout: float) -> str:
     line, end, _ = connection.handshake.partition(b"\r\n")
     status = re.match(rb"HTTP/\S+ (\d{3})\b", line)
     if status and status[1] != b"101":
-        return http_refusal(int(status[1]), connection.handshake.partition(b"\r\n\r\n")[2])
+        return http_refusal(int(status[1]), connection.handshake.partition(b"\r\n\r\n")[2], endpoint.token)
     if not connection.is_closed.done():
-        return silent(address, timeout)
+        return silent(endpoint.address, timeout)
     reason = connection.wasNotCleanReason if status else "connection closed while reading HTTP status line"
     if end and not status:
         reason = f"unsupported protocol; expected HTTP/1.1: {line[:100].decode(errors='replace')}"

@@ -107,11 +107,12 @@ def no_websocket(reason: object) -> str:
     return f"something listens there that is no WebSocket server ({reason}). {hint}"
 
 
-def http_refusal(status: int, body: bytes) -> str:
-    """The reason why a web server did not open a WebSocket, by its response."""
+def http_refusal(status: int, body: bytes, token: str | None) -> str:
+    """The reason why a web server did not open a WebSocket, by its response; `token` is what it was shown."""
     said = body[:300].decode(errors="replace").strip()
     if status in (400, 403, 429, 503) and said.endswith("."):  # a server of ours gives its reason
         return f"the server refuses this client (HTTP {status}): {said}"
     if status in (401, 403):
-        return f"the token was refused (HTTP {status}). Give the server's token (--token-file)."
+        why = "the token was refused" if token else "the server asks for a token, and none was given"
+        return f"{why} (HTTP {status}). Give the server's token (--token-file)."
     return f"a web server answers there, with HTTP {status}: no WebSocket. Is it the right port?"

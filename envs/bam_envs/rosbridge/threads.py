@@ -13,6 +13,8 @@ from bam_envs.core.errors import LinkLost
 
 T = TypeVar("T")
 _PATIENCE = 10.0
+_LISTENER = "A listener must return at once: do work in another thread."
+_BUSY = "This computer is busy: end other programs on it."
 
 
 class LoopThread:
@@ -22,6 +24,8 @@ class LoopThread:
         self._name, self._owner, self.was_started = name, owner, False
         self.loop: asyncio.AbstractEventLoop | None = None
         """The loop while it runs; one that runs in a thread of other code can be put here."""
+        self.listens = False
+        """Whether it calls a listener now, or may, which is the likely cause when it is held up."""
         self._thread: threading.Thread | None = None
 
     @property
@@ -85,7 +89,7 @@ class LoopThread:
             if done.cancel():
                 raise LinkLost(
                     f"{self._owner}: the network thread took nothing for {within:g} s; nothing was sent. "
-                    "A listener must return at once: do work in another thread."
+                    f"{_LISTENER if self.listens else _BUSY}"
                 ) from None
             return done.result()  # it is running
         finally:

@@ -43,7 +43,7 @@ class UserRosLink(RosBus):
     def __init__(self, ros: Ros) -> None:
         address = endpoint_of(ros).address
         super().__init__(address.url, address.namespace, "roslibpy")
-        self._ros = ros
+        self._ros, self._thread.listens = ros, True
         self._has_asked = False  # since the last message was published
         self._hooks: dict[str, Callable[[Any], None]] = {  # by event of roslibpy's; a topic and a service is one, too
             "ready": partial(tell, self._begin),

@@ -339,7 +339,7 @@ class SafeRobot(metaclass=Sealed):
     def report(self) -> dict[str, dict[str, Any]]:
         """For each guard: number, limit, unit, commands altered, ticks held, and stops of the robot.
 
-        Commands that were altered on the way to a start pose are not counted.
+        Commands that were altered, and ticks held, on the way to a start pose are not counted.
         """
         return {name: dict(row) for name, row in self._report.items()}
 
@@ -560,15 +560,15 @@ class SafeRobot(metaclass=Sealed):
             if guard.limit(tick) and not tick.approach:
                 self._note(guard, "altered")
 
-    def _note(self, guard: Guard, effect: str) -> None:
+    def _note(self, guard: Guard, effect: str, *, counts: bool = True) -> None:
         self._status, self._code = self._facts[id(guard)]
-        self._report[guard.name][effect] += 1
+        self._report[guard.name][effect] += counts
         self._kept_out |= guard.keeps_out
 
     def _hold(self, tick: Tick, guard: Guard, reason: str) -> None:
         """Send a command that holds the robot in place; stop the robot after too many ticks in a row."""
         self._kept_out = False
-        self._note(guard, "held")
+        self._note(guard, "held", counts=not tick.approach)
         self._bad += 1
         if self._bad >= guard.patience:
             once = self._bad == 1 or isinstance(guard, Share)

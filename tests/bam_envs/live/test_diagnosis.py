@@ -185,6 +185,8 @@ def test_another_arm_than_the_profile_says_is_named_by_its_joints(server, robot_
     )
     sevenfold = other.format("xarm_ros2", ", ".join(f"joint{number}" for number in range(1, 8)))
     assert failure(diagnose(server.url, profile="xarm_ros2")[1]) == ("topics", sevenfold)
+    franka = other.format("franka_ros2", ", ".join(f"fr3_joint{number}" for number in range(1, 8)))
+    assert failure(diagnose(server.url, profile="franka_ros2")[1]) == ("topics", franka)  # whose topics are there
     with pytest.raises(ProtocolError) as error:  # as a program that moves it
         live_robot(server.url, profile="ur5e").connect()
     assert str(error.value) == f"{server.url}: {other.format('ur5e', ', '.join(UR_JOINTS))}"

@@ -454,3 +454,13 @@ def test_a_held_up_network_thread_sends_nothing_late_but_what_may_not_be_given_u
     )
     link.publish("/cmd", {"data": "now"})
     assert [frame["msg"]["data"] for frame in scripted.wait_for("publish", 2)] == ["halt", "now"]
+    leave.clear()
+    with pytest.raises(LinkLost):
+        link.do_surely(lambda: leave.wait(10.0))  # no listener, as on a busy computer
+    with pytest.raises(LinkLost) as raised:
+        link.publish("/cmd", {"data": "late"})
+    leave.set()
+    assert str(raised.value) == (
+        f"{scripted.url}: the network thread took nothing for 0.5 s; nothing was sent. "
+        "This computer is busy: end other programs on it."
+    )

@@ -152,6 +152,8 @@ def test_a_token_that_is_refused_is_shown_once(new_scripted, status, caplog):
     server = new_scripted(status=status)
     text = failure(server.url, token="wrong", connect_timeout=30.0)
     assert text == f"the token was refused (HTTP {status}). Give the server's token (--token-file)."
+    none = f"the server asks for a token, and none was given (HTTP {status}). Give the server's token (--token-file)."
+    assert failure(new_scripted(status=status).url, connect_timeout=30.0) == none
     assert len(server.headers) == 1  # what will not change is not tried twice
     assert caplog.records == []  # websockets would say it too, in its own words
 

@@ -339,6 +339,23 @@ def test_what_was_altered_is_counted_by_guard_and_told_by_status():
     assert [name for name, row in robot.report().items() if row["altered"]] == ["joint acceleration"]
 
 
+def test_ticks_in_which_the_robot_is_held_on_the_way_to_its_start_are_told_and_not_counted():
+    """A deployment counts the ticks of its episodes, and its report says in how many of these a guard acted."""
+    arm, robot, _ = live()
+    seen = []
+
+    def pause_once():
+        arm.now, arm.during = arm.now + 0.3, None
+
+    robot.observe(lambda tick, state: seen.append((tick.approach, robot.status)))
+    arm.during = pause_once
+    robot.reset(FIRST, start_at(ARM_HOME + 0.1))
+    assert (True, "command pace (G15)") in seen
+    assert [name for name, row in robot.report().items() if row["altered"] or row["held"]] == []
+    robot.step(NAN)
+    assert (robot.report()["finite"]["held"], seen[-1]) == (1, (False, "finite (G2)"))
+
+
 class Opener(Guard):
     """Allows everything, and more than it was asked."""
 

@@ -143,6 +143,7 @@ def test_a_wrong_token(server, tmp_path):
     (tmp_path / "token").write_text("x")
     text = "the token was refused (HTTP 401). Give the server's token (--token-file)."
     assert refused(server.url, token_file=tmp_path / "token") == f"{server.url}: {text}"
+    text = "the server asks for a token, and none was given (HTTP 401). Give the server's token (--token-file)."
     assert refused(server.url) == f"{server.url}: {text}"
 
 

@@ -199,6 +199,8 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(versions, some, tmp_path):
             with raising(OutputError, why):
                 change()
     assert files(versions) == before
+    with full_disk(0), raising(OutputError, why), versions.held():
+        pass
     assert versions.names == {"champion": one.digest}
     assert load_policy(versions.find("champion")).act(np.ones(1, np.float32)) == 1
     versions.add(other)

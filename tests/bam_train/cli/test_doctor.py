@@ -9,6 +9,7 @@ import pytest
 
 from bam_envs.core.robot_models import SHIPPED
 from bam_envs.live.diagnosis import STEPS
+from bam_envs.live.examination import Inspection
 from bam_envs.remote.serve.serve_options import ServeOptions
 from bam_envs.remote.serve.served_environment import ServedEnvironment
 from bam_envs.robots.linked import link_profile
@@ -30,15 +31,20 @@ def nobody():
         return f"ws://127.0.0.1:{probe.getsockname()[1]}"
 
 
-def test_a_healthy_robot(run, served, tmp_path):
+@pytest.mark.parametrize("busy", ["", "this computer is busy: 9 of 20 ticks came late"])
+def test_a_healthy_robot(run, served, tmp_path, monkeypatch, busy):
+    monkeypatch.setattr(Inspection, "busy", busy)
     path = tmp_path / "new" / "link.json"
     status, out, err = run(doctor, served, "--seconds", 0.8, "--measure", path)
     assert (status, err) == (0, "")
     lines = out.splitlines()
     assert [line.split("  ")[0] for line in lines if not line.startswith(" ")][:-1] == list(STEPS)
-    assert lines[-1] == f"{path}: the measured link; try it with bam-deploy CHECKPOINT --rehearse {path}"
+    then = f"; {busy}; end other programs, and measure again"
+    rehearse = f"; try it with bam-deploy CHECKPOINT --rehearse {path}"
+    assert lines[-1] == f"{path}: the measured link{then if busy else rehearse}"
     link = link_profile(str(path))
     assert link.about.startswith(f"{served}, ")
+    assert link.about.endswith(f" s; {busy}" if busy else " s")
     assert link.command_loss == 0.0
 
 

@@ -206,6 +206,21 @@ def test_an_environment_without_a_robot(corridor_checkpoint, tmp_path, capsys):
     assert "was trained on test/Corridor-v0, not on bam/pick" in capsys.readouterr().err
 
 
+def test_other_actions_of_a_policy_with_chunks_are_explained(chunk_checkpoint, tmp_path, capsys):
+    """Beside a loop with deadlines, its chunks come sooner or later; with --fast the loop waits for them."""
+    path, slower = tmp_path / "a.mcap", chunk_checkpoint("slower.zip", size=20, steps=15)
+    assert call(deploy, chunk_checkpoint(size=20, steps=10), "--fast", "--episodes", 1, "--record", path) == 0
+    capsys.readouterr()
+    assert call(replay, path) == 0
+    ticks = Recording.open(path).ticks
+    same = f"played: the same observation in {ticks} of {ticks} ticks, the same action in "
+    assert capsys.readouterr().out.splitlines()[-1] == f"{same}{ticks}"
+    assert call(replay, path, "--checkpoint", slower) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert (lines[-2].startswith(same), lines[-2].endswith(" apart")) == (True, True)
+    assert lines[-1] == "chunks are computed beside the loop: which one a tick had depends on how long each took"
+
+
 def test_a_checkpoint_that_is_gone_or_changed(pick, corridor_checkpoint, tmp_path, capsys):
     path, checkpoint = tmp_path / "a.mcap", corridor_checkpoint()
     assert call(deploy, checkpoint, "--fast", "--episodes", 1, "--record", path) == 0
