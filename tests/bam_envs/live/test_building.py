@@ -225,7 +225,7 @@ def test_its_token(tmp_path, robot_on, start_pose):
         robot.connect()
         robot.reset(ROW, start_pose)
         robot.close()
-        with pytest.raises(LinkLost, match="token was refused"):
+        with pytest.raises(LinkLost, match=r"the server asks for a token, and none was given \(HTTP 401\)"):
             live_robot(server.url).connect()
 
 
