@@ -216,14 +216,16 @@ def test_the_cut_link_of_the_owner_holds_the_robot_and_pauses_the_policy(running
     running.run()
     program = (
         "import sys, time, gymnasium as gym, bam_envs\n"
+        "from bam_envs.core import errors\n"
         "for attempt in range(20):\n"
         f"    env = gym.make('bam/pick-v0', robot={running.url!r}, disable_env_checker=True)\n"
         "    try:\n"
         "        env.unwrapped.robot.connect()\n"
         "        env.unwrapped.robot._robot._take_over.take()\n"
         "        break\n"
-        "    except (bam_envs.core.errors.LinkLost, bam_envs.core.errors.StaleState):\n"  # on a busy computer
+        "    except (errors.LinkLost, errors.StaleState, errors.NotInCommand):\n"  # on a busy computer
         "        env.close()\n"
+        "        time.sleep(0.5)\n"
         "else:\n"
         "    sys.exit('nobody could take over')\n"
         "print('driving', flush=True)\n"
