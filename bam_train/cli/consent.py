@@ -17,7 +17,7 @@ from bam_envs.core.wording import listed
 from bam_envs.safety.guard import is_base
 from bam_train.agent.agent_states import State
 from bam_train.checkpoint import Checkpoint
-from bam_train.cli.console import ask, say
+from bam_train.cli.console import ask, can_ask, say
 from bam_train.deploy.checkpoint_admission import bring_up, has_real_robot
 from bam_train.environments import environment_of, make_env, require_fit
 from bam_train.errors import SettingsError
@@ -176,7 +176,7 @@ def require_consent(env: Any, who: str, *, yes: bool, plan: Sequence[str] = ()) 
     if not services:  # else it is not ready before they are called
         _require_ready(robot)
     if not yes:
-        if not sys.stdin.isatty():
+        if not can_ask():
             raise SettingsError(
                 "a real robot would move, and there is nobody to ask; give --yes to go on without asking"
             )

@@ -41,6 +41,11 @@ def tell(*lines: str) -> None:
     print("\n".join(map(shown, lines)), flush=True)
 
 
+def can_ask() -> bool:
+    """Whether standard input is a terminal, at which somebody may answer; it is None where it is closed."""
+    return sys.stdin is not None and sys.stdin.isatty()
+
+
 def ask(question: str, write: Callable[[str], None]) -> str:
     """Write `question` to the terminal that is standard input; returns the line typed from then on, in lower case.
 

@@ -9,14 +9,13 @@ from __future__ import annotations
 import json as json_module
 import math
 import pkgutil
-import sys
 from contextlib import nullcontext
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import can_draw, make_console, say, tell
+from bam_train.cli.console import can_ask, can_draw, make_console, say, tell
 from bam_train.cli.program import run_program
 from bam_train.signals import SignalMemory
 
@@ -113,7 +112,7 @@ def _run(
         deployment.switch.came += signals.came  # after a lost exception, the deployment ends before it begins
         plain = nullcontext(PlainDeployment(journal, say))
         with live_display(make_console(), env, title, journal) if can_draw() else plain as watcher:
-            if not config.yes and sys.stdin.isatty():
+            if not config.yes and can_ask():
                 deployment.judge = watcher.judge
             ending = deployment.run(watcher, seed=seed)
         if ending.status:

@@ -10,7 +10,7 @@ from math import inf
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
-from bam_train.cli.console import can_draw, say, tell
+from bam_train.cli.console import can_ask, can_draw, say, tell
 from bam_train.cli.program import run_program
 from bam_train.errors import SettingsError
 from bam_train.files.log_lines import counted
@@ -31,7 +31,7 @@ DRAWN = 0.1
 
 def play(config: PlayConfig, signals: SignalMemory) -> int:
     """Run the program with its parsed flags."""
-    if not config.render and not sys.stdin.isatty():
+    if not config.render and not can_ask():
         raise SettingsError("standard input is no terminal: run it in one, or in a window with --render", exit_status=2)
     if not config.render and sys.stderr.isatty() and not can_draw():
         what = f"a terminal with TERM={os.environ['TERM']} draws no screen"

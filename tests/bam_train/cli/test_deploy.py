@@ -28,7 +28,8 @@ def corridor_class(corridor):
     return gym.spec(corridor).entry_point
 
 
-def test_report_for_programs(corridor_checkpoint, starting_cell, run):
+def test_report_for_programs(corridor_checkpoint, starting_cell, run, monkeypatch):
+    monkeypatch.setattr(sys, "stdin", None)  # as Python has it where a program starts this one without any
     path = corridor_checkpoint()
     status, out, err = run(main, path, "--fast", "--json", "--episodes", 3, "--seed", 7)
     report = json.loads(out)
