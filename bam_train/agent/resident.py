@@ -739,7 +739,7 @@ class Resident:
         """Those of the guards, and of late ticks, by title, as long as they hold."""
         if self.session is None:
             return {}
-        warnings = dict(one.split(": ", 1) for one in self.session.deployment.warnings)
+        warnings = dict(one.partition(": ")[::2] for one in self.session.deployment.warnings)
         late = self.session.deployment.times.warning
         return warnings if LATE in warnings or not late else {**warnings, "late ticks": late}
 

@@ -293,7 +293,7 @@ def excuse_of(error: Exception, robot: Any, times: TickTimes) -> str:
     if is_ours or isinstance(error, SafetyStop):  # else by a guard of the live agent there
         return times.excuse(by_time=is_ours and robot.code in TIMING_GUARDS)
     if isinstance(error, LinkLost):
-        return "the link to the robot was lost"
+        return "the link to the robot, or to the server of the policy, was lost"
     return "somebody else drives the robot" if isinstance(error, NotInCommand) else ""
 
 

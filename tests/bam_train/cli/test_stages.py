@@ -197,7 +197,7 @@ BUSY = "20 of the last 20 ticks were disturbed, and an action needs 0 ms of the 
 @pytest.mark.parametrize(
     ("error", "guard", "late", "excuse"),
     [
-        (LinkLost("the link dropped"), 0, 0.0, "the link to the robot was lost"),
+        (LinkLost("the link dropped"), 0, 0.0, "the link to the robot, or to the server of the policy, was lost"),
         (STOP, 23, 0.0, ""),
         (STOP, 23, 0.01, f"{BUSY}: the computer is busy"),
         (STOP, 15, 0.0, f"{BUSY.partition('and ')[2]}: the computer or the link was late"),
